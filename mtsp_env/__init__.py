@@ -1,0 +1,53 @@
+"""The MinMax multiple travelling salesman problem as a multi-agent environment.
+
+>>> from mtsp_env import mtsp_v0
+>>> env = mtsp_v0.env(n_nodes=50, n_agents=5)
+
+Importing this package needs only NumPy, Gymnasium and PettingZoo; the batched TorchRL environment is in
+``mtsp_env.batched``.
+"""
+
+from mtsp_env.instance import (
+    DISTRIBUTIONS,
+    Instance,
+    clustered,
+    from_coordinates,
+    read_instance,
+    read_tours,
+    uniform,
+    write_instance,
+    write_tours,
+)
+from mtsp_env.tours import check_tours, lower_bound, makespan, tour_lengths
+from mtsp_env.tsplib import read_tsplib
+from mtsp_env.version import __version__
+
+__all__ = [
+    "DISTRIBUTIONS",
+    "Instance",
+    "__version__",
+    "check_tours",
+    "clustered",
+    "from_coordinates",
+    "lower_bound",
+    "makespan",
+    "read_instance",
+    "read_tours",
+    "read_tsplib",
+    "tour_lengths",
+    "uniform",
+    "write_instance",
+    "write_tours",
+]
+
+
+def _register() -> None:
+    """Make ``pettingzoo.make("aec", "mtsp/mtsp-v0")`` work where this PettingZoo has a registry (1.27 on)."""
+    try:
+        from pettingzoo import register
+    except ImportError:
+        return
+    register("aec", "mtsp/mtsp-v0", entry_point="mtsp_env.mtsp_v0:env")
+
+
+_register()

@@ -1,0 +1,72 @@
+"""The only judge of tours: lengths, makespan, validity and a lower bound. No solver's own cost is ever trusted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mtsp_env.instance import Instance
+
+
+def tour_lengths(nodes: np.ndarray, tours: Sequence[Sequence[int]]) -> np.ndarray:
+    """Length of each tour, float64 (len(tours),), in the units of ``nodes`` (n, 2)."""
+    nodes = np.asarray(nodes, dtype=np.float64)
+    return np.array([np.linalg.norm(np.diff(nodes[list(tour)], axis=0), axis=1).sum() for tour in tours])
+
+
+def makespan(nodes: np.ndarray, tours: Sequence[Sequence[int]]) -> float:
+    """Length of the longest tour: the paper's objective (Sec. 3), to be small."""
+    return float(tour_lengths(nodes, tours).max(initial=0.0))
+
+
+def check_tours(instance: Instance, tours: Sequence[Sequence[int]]) -> None:
+    """Raise ValueError unless ``tours`` solve ``instance``.
+
+    One tour per agent, each beginning and ending at the depot, every city on exactly one of them, once. A tour may pass
+    the depot in between (the environment's depot rule "open" allows it); ``[0, 0]`` is an agent that stays at home.
+    """
+    if len(tours) != instance.n_agents:
+        raise ValueError(f"expected {instance.n_agents} tours, one per agent, got {len(tours)}")
+    count = np.zeros(instance.n_nodes, dtype=np.int64)
+    for agent, tour in enumerate(tours):
+        tour = np.asarray(tour)
+        if tour.ndim != 1 or not np.issubdtype(tour.dtype, np.integer) or len(tour) < 2:
+            raise ValueError(f"tour {agent} must be a list of at least 2 node numbers, got {tour.tolist()}")
+        outside = tour[(tour < 0) | (tour >= instance.n_nodes)]
+        if len(outside):
+            raise ValueError(f"tour {agent} visits node {outside[0]}, outside 0..{instance.n_nodes - 1}")
+        if tour[0] != 0 or tour[-1] != 0:
+            raise ValueError(f"tour {agent} must begin and end at the depot 0, got {tour[0]} and {tour[-1]}")
+        count += np.bincount(tour, minlength=instance.n_nodes)
+    missing = np.flatnonzero(count[1:] == 0) + 1
+    if len(missing):
+        raise ValueError(f"{_cities(missing)} missing from the tours")
+    repeated = np.flatnonzero(count[1:] > 1) + 1
+    if len(repeated):
+        raise ValueError(f"{_cities(repeated)} visited more than once")
+
+
+def _cities(numbers: np.ndarray) -> str:
+    named = ", ".join(str(number) for number in numbers[:5])
+    return f"city {named}" if len(numbers) == 1 else f"cities {named}{', ...' if len(numbers) > 5 else ''}"
+
+
+def lower_bound(instance: Instance) -> float:
+    """No makespan is below this: the farthest out-and-back trip, or the minimum spanning tree over m where larger.
+
+    The m tours together hold a spanning tree of all nodes, so the longest is at least the tree's length over m.
+    O(n^2) time, O(n) memory (Prim's algorithm).
+    """
+    nodes = instance.nodes
+    farthest = 2.0 * float(np.linalg.norm(nodes - nodes[0], axis=1).max())
+    distance = np.linalg.norm(nodes - nodes[0], axis=1)  # (n,) of each node to the tree grown so far
+    outside = np.ones(len(nodes), dtype=bool)
+    outside[0] = False
+    tree = 0.0
+    for _ in range(len(nodes) - 1):
+        nearest = int(np.argmin(np.where(outside, distance, np.inf)))
+        tree += float(distance[nearest])
+        outside[nearest] = False
+        distance = np.minimum(distance, np.linalg.norm(nodes - nodes[nearest], axis=1))
+    return max(farthest, tree / instance.n_agents)
