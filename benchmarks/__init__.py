@@ -1,0 +1,1 @@
+"""Benchmarks of the MinMax mTSP; run from a checkout as ``python -m benchmarks``."""

@@ -1,0 +1,107 @@
+"""From an instance to tours in one call."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import torch
+from torch import nn
+
+from dan_policy.actor import make_actor
+from dan_policy.network import DAN
+from dan_policy.episode import Decode, rollout
+from dan_policy.weights import find, load
+from mtsp_env.batched import BatchedMTSP
+from mtsp_env.instance import Instance, Tours, check_count
+from mtsp_env.tours import check_tours, makespan
+
+SPEED = 0.01  # the paper's Delta g in tests (Sec. 6)
+SHARP_FROM, SHARP_CLIP = 500, 100.0  # the paper samples with C = 100 from n = 500 on (Sec. 6.1)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What ``solve`` found.
+
+    Attributes:
+        tours: one per agent, each from depot to depot.
+        makespan: the longest tour, in unit-square units; times ``instance.scale`` it is in the source's.
+        seconds: wall-clock time of the planning, without loading the weights.
+        method: for tables, e.g. "dan(g.)" or "dan(s.64)".
+    """
+
+    tours: Tours
+    makespan: float
+    seconds: float
+    method: str
+
+
+def solve(
+    instance: Instance,
+    policy: str | os.PathLike | nn.Module = "default",
+    decode: Decode = "greedy",
+    samples: int = 64,
+    seed: int = 0,
+    device: torch.device | str | None = None,
+) -> Solution:
+    """Plan the team's tours with a policy (paper, Sec. 6: DAN(g.) and DAN(s.64)).
+
+    The games are played with the depot rule "final", so that tours are complete whatever the policy does.
+
+    Args:
+        policy: the name of a shipped model, a file that ``dan_policy.save`` wrote, a ``DAN``, or any actor built by
+            ``make_actor``.
+        decode: "greedy": one game of likeliest actions. "sample": ``samples`` games of drawn ones, the best counts.
+        samples: games played side by side where ``decode`` is "sample", at least 1.
+        seed: of the samples; the same call gives the same tours on the same machine.
+        device: None takes a GPU where there is one.
+
+    Raises:
+        OSError: no such weights.
+        ValueError: bad weights, or an argument outside its range.
+    """
+    check_count("samples", samples, minimum=1)
+    if decode not in ("greedy", "sample"):
+        raise ValueError(f"unknown decode {decode!r}; choose from ['greedy', 'sample']")
+    device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    sharp = decode == "sample" and instance.n_nodes >= SHARP_FROM
+    actor = _actor(policy, device, sharp)
+
+    start = time.perf_counter()
+    rows = samples if decode == "sample" else 1
+    env = BatchedMTSP(
+        instance.n_nodes, instance.n_agents, [rows], SPEED, depot="final", device=device, check_actions=False
+    )
+    nodes = torch.as_tensor(instance.nodes.copy(), device=device).expand(rows, -1, -1)
+    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+        torch.manual_seed(seed)
+        last = rollout(actor, env, decode, nodes).last
+    best = env.makespan(last).argmin()[None]
+    tours = env.tours(last[best])[0]
+    seconds = time.perf_counter() - start
+
+    check_tours(instance, tours)
+    method = "dan(g.)" if decode == "greedy" else f"dan(s.{samples})"
+    return Solution(tours, makespan(instance.nodes, tours), seconds, method)
+
+
+def _actor(policy: str | os.PathLike | nn.Module, device: torch.device, sharp: bool) -> nn.Module:
+    if not isinstance(policy, nn.Module):
+        file = find(policy)
+        policy = _loaded(file, file.stat().st_mtime_ns, device)
+    if not isinstance(policy, DAN):
+        return policy.to(device)
+    if sharp:
+        clipped = DAN(replace(policy.config, tanh_clip=SHARP_CLIP))
+        clipped.load_state_dict(policy.state_dict())
+        policy = clipped
+    return make_actor(policy.to(device).eval())
+
+
+@lru_cache(maxsize=4)
+def _loaded(file: os.PathLike, _changed: int, device: torch.device) -> DAN:
+    """Weights are read once per process and file version: who replans every second should not wait for the disk."""
+    return load(file, device)

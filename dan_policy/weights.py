@@ -1,0 +1,82 @@
+"""Networks on disk: safetensors with the configuration as JSON inside its metadata. No pickle, nothing is executed."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from dan_policy.network import DAN, DANConfig
+
+FORMAT = "dan-policy-1"
+SHIPPED = Path(__file__).parent / "weights"
+
+
+def save(path: str | os.PathLike, network: DAN, **extra: object) -> None:
+    """Write ``network`` to a ``.safetensors`` file; ``extra`` (JSON values, e.g. how it was trained) goes into its metadata.
+
+    Written to a temporary name and moved, so that a crash leaves an older file whole.
+    """
+    path = Path(path)
+    metadata = {"format": FORMAT, "config": json.dumps(asdict(network.config)), "extra": json.dumps(extra)}
+    tensors = {key: value.detach().cpu().contiguous() for key, value in network.state_dict().items()}
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        save_file(tensors, temporary, metadata)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def load(path: str | os.PathLike, device: torch.device | str = "cpu") -> DAN:
+    """The network that ``save`` wrote to ``path``, or a shipped one by its name ("default"), in evaluation mode.
+
+    Raises:
+        OSError: no such file.
+        ValueError: not such a file, a damaged one, or weights that do not fit their configuration.
+    """
+    return _read(path, device)[0]
+
+
+def load_extra(path: str | os.PathLike) -> dict:
+    """What was given to ``save`` beside the network. Raises as ``load``."""
+    return _read(path, "cpu")[1]
+
+
+def shipped() -> list[str]:
+    """Names of the models that come with the package."""
+    return sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
+
+
+def find(path: str | os.PathLike) -> Path:
+    """The file behind a path or the name of a shipped model."""
+    if str(path) in shipped():
+        return SHIPPED / f"{path}.safetensors"
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no weights at {path}; shipped are {shipped()}")
+    return path
+
+
+def _read(path: str | os.PathLike, device: torch.device | str) -> tuple[DAN, dict]:
+    path = find(path)
+    try:
+        with safe_open(path, framework="pt", device=str(device)) as file:
+            metadata = file.metadata() or {}
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
+    except SafetensorError as error:
+        raise ValueError(f"{path}: not a safetensors file, or a damaged one ({error})") from error
+    if metadata.get("format") != FORMAT:
+        raise ValueError(f"{path}: expected format {FORMAT!r} in its metadata, got {metadata.get('format')!r}")
+    try:
+        network = DAN(DANConfig(**json.loads(metadata["config"])))
+        extra = json.loads(metadata["extra"])
+        network.load_state_dict(tensors)
+    except (KeyError, TypeError, RuntimeError, ValueError) as error:
+        raise ValueError(f"{path}: weights and configuration do not fit ({error})") from error
+    return network.to(device).eval(), extra

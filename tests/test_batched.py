@@ -1,0 +1,207 @@
+"""The TorchRL face: specs, resets, replay, seeds, and the same games whatever the batch."""
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs, step_mdp
+
+from mtsp_env import Instance, check_tours, lower_bound, makespan, rules
+from mtsp_env.batched import BatchedMTSP
+
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device"))]
+
+
+def make(batch=6, n_nodes=9, n_agents=3, **kwargs):
+    return BatchedMTSP(n_nodes, n_agents, [batch], **{"seed": 0, "speed": 0.1, **kwargs})
+
+
+def given(nodes):
+    return TensorDict({"nodes": torch.as_tensor(nodes)}, batch_size=[len(nodes)])
+
+
+def play(env, td):
+    """Random legal play to the end; returns every root TensorDict on the way and the last one."""
+    steps = []
+    while not td["done"].all():
+        td = env.rand_action(td)
+        steps.append(td.clone())
+        td = step_mdp(env.step(td), exclude_reward=False)
+    return steps, td
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("depot", ["open", "final"])
+@pytest.mark.parametrize("reward", ["sparse", "shaped"])
+def test_specs_hold_in_both_break_modes(depot, reward, device):
+    check_env_specs(make(depot=depot, reward=reward, device=device), break_when_any_done="both")
+
+
+def test_root_keys_are_the_documented_ones():
+    env = make()
+    td = env.step(env.rand_action(env.reset()))
+    seen = {"cities", "agents", "visited", "action_mask", "agent"}
+    over = {"done", "terminated", "truncated"}
+    assert set(td.keys()) == seen | over | set(rules.State._fields) | {"action", "next"}
+    assert set(td["next"].keys()) == seen | over | set(rules.State._fields) | {"reward"}
+    assert td["next", "reward"].shape == (6, 1) and td["cities"].dtype == torch.float32
+
+
+@pytest.mark.parametrize("depot", ["open", "final"])
+def test_finished_games_are_valid_and_the_reward_is_the_judged_makespan(depot):
+    env = make(batch=32, depot=depot)
+    td = env.reset()
+    total, first_done = torch.zeros(32), torch.zeros(32, dtype=torch.bool)
+    while not td["done"].all():
+        td = step_mdp(env.step(env.rand_action(td)), exclude_reward=False)
+        total += torch.where(first_done, 0.0, td["reward"][:, 0])
+        first_done |= td["done"][:, 0]
+    cost = env.makespan(td)
+    for row, tours in enumerate(env.tours(td)):
+        instance = Instance(td["nodes"][row].numpy(), 3)
+        check_tours(instance, tours)
+        judged = makespan(instance.nodes, tours)
+        assert cost[row] == pytest.approx(judged, abs=1e-9)
+        assert -total[row] == pytest.approx(judged, rel=1e-6)
+        assert judged >= lower_bound(instance) - 1e-9
+
+
+def test_seeds_repeat_and_differ():
+    first, again, other = (make(seed=seed).reset()["nodes"] for seed in (1, 1, 2))
+    assert torch.equal(first, again) and not torch.equal(first, other)
+    env = make(seed=5)
+    env.set_seed(1)
+    assert torch.equal(env.reset()["nodes"], first)
+    assert not torch.equal(env.reset()["nodes"], first)
+
+
+def test_given_instances_are_replayed_exactly():
+    env = make()
+    nodes = np.random.default_rng(3).random((6, 9, 2))
+    td = env.reset(given(nodes), set_state=True)
+    assert np.array_equal(td["nodes"].numpy(), nodes)
+    steps, _ = play(env, td)
+    replay = env.reset(given(nodes), set_state=True)
+    for step in steps:
+        for key in ("cities", "agents", "visited", "action_mask", "agent"):
+            assert torch.equal(replay[key], step[key]), key
+        replay = step_mdp(env.step(replay.set("action", step["action"])))
+
+
+def test_a_game_goes_on_from_any_kept_state():
+    env = make()
+    td = env.reset()
+    for _ in range(4):
+        td = step_mdp(env.step(env.rand_action(td)))
+    resumed = make(seed=99).reset(td.select(*rules.State._fields), set_state=True)
+    for key in ("cities", "agents", "visited", "action_mask", "agent", "done"):
+        assert torch.equal(resumed[key], td[key]), key
+
+
+def test_partial_resets_leave_other_rows_bit_identical():
+    env = make()
+    td = env.reset()
+    for _ in range(3):
+        td = step_mdp(env.step(env.rand_action(td)))
+    before = td.clone()
+    reset = torch.tensor([True, False, False, True, False, False])
+    after = env.reset(td.set("_reset", reset[:, None]), set_state=False)
+    for key in (*rules.State._fields, "cities", "agents", "visited", "action_mask"):
+        assert torch.equal(after[key][~reset], before[key][~reset]), key
+    assert (after["decisions"][reset] == 0).all()
+    assert not torch.equal(after["nodes"][reset], before["nodes"][reset])
+
+
+@pytest.mark.parametrize("depot", ["open", "final"])
+def test_a_row_of_many_equals_a_batch_of_one(depot):
+    env = make(batch=64, depot=depot)
+    td = env.reset()
+    nodes = td["nodes"].clone()
+    steps, _ = play(env, td)
+    for row in (0, 17, 63):
+        alone = make(batch=1, depot=depot)
+        one = alone.reset(given(nodes[row : row + 1]), set_state=True)
+        for step in steps:
+            for key in ("cities", "agents", "visited", "action_mask", "agent", *rules.State._fields):
+                assert torch.equal(one[key][0], step[key][row]), key
+            if one["done"].all():
+                break
+            one = step_mdp(alone.step(one.set("action", step["action"][row : row + 1])))
+
+
+def test_auto_reset_never_offers_or_takes_an_illegal_action():
+    env = make(batch=500, n_nodes=8, n_agents=3, depot="open")
+    td, decisions, resets = env.reset(), 0, 0
+    while decisions < 100_000:
+        assert td["action_mask"].any(1).all()
+        assert not (td["action_mask"] & td["visited"]).any()
+        td = env.rand_action(td)
+        assert td["action_mask"].gather(1, td["action"][:, None]).all()
+        td, next_td = env.step_and_maybe_reset(td)
+        resets += int(td["next", "done"].sum())
+        td = next_td
+        decisions += 500
+    assert resets > 1000
+
+
+def test_torchrl_rollout_agrees_with_stepping():
+    env = make(seed=4)
+    torch.manual_seed(0)
+    data = env.rollout(1000, break_when_any_done=False, break_when_all_done=True)
+    assert data["next", "done"].any(1).all()
+
+
+def test_distributions_fill_the_batch():
+    nodes = make(distribution="clustered").reset()["nodes"]
+    assert nodes.shape == (6, 9, 2) and nodes.min() >= 0 and nodes.max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"n_nodes": 1}, "n_nodes must be a whole number of at least 2, got 1"),
+        ({"n_agents": 0}, "n_agents must be a whole number of at least 1, got 0"),
+        ({"batch": 0}, r"batch_size must be \[B\] with B of at least 1, got \[0\]"),
+        ({"speed": 0.0}, "speed must be a finite distance"),
+        ({"depot": "closed"}, "unknown depot rule 'closed'"),
+        ({"reward": "dense"}, "unknown reward 'dense'"),
+        ({"max_decisions": 0}, "max_decisions must be a whole number of at least 1, got 0"),
+        ({"distribution": "normal"}, "unknown distribution 'normal'"),
+    ],
+)
+def test_bad_arguments_are_named(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        make(**kwargs)
+
+
+@pytest.mark.parametrize("action", [0, 3, 9, -1])
+def test_an_illegal_action_names_row_agent_and_choices(action):
+    env = make()
+    td = env.reset()  # nobody may wait while everybody is at the depot
+    td = step_mdp(env.step(td.set("action", torch.full((6,), 3))))
+    actions = torch.full((6,), 4)
+    actions[2] = action
+    if action == 0:
+        td = env.reset()
+    with pytest.raises(ValueError, match=rf"of row 2 may not go to node {action}; legal are \["):
+        env.step(td.set("action", actions))
+
+
+def test_bad_replays_are_refused():
+    env = make()
+    with pytest.raises(ValueError, match="nodes must have shape"):
+        env.reset(given(np.zeros((6, 8, 2))), set_state=True)
+    with pytest.raises(ValueError, match="unit square"):
+        env.reset(given(np.full((6, 9, 2), 2.0)), set_state=True)
+    with pytest.raises(ValueError, match="call reset"):
+        make().tours()
+
+
+def test_truncation_pays_the_trips_to_every_city_left():
+    env = make(batch=4, max_decisions=2)
+    _, td = play(env, env.reset())
+    assert td["truncated"].all() and not td["terminated"].any()
+    nodes = td["nodes"]
+    trips = 2 * (nodes - nodes[:, :1]).norm(dim=2) * ~td["visited"]
+    so_far = torch.tensor([makespan(x.numpy(), t) for x, t in zip(nodes, env.tours(td), strict=True)])
+    assert torch.allclose(-td["reward"][:, 0].double(), so_far + trips.sum(1), rtol=1e-6)

@@ -1,0 +1,136 @@
+"""DAN: symmetries, masking, precision, gradients."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from dan_policy.network import DAN, AttentionLayer, DANConfig
+
+SMALL = DANConfig(embed_dim=16, feedforward_dim=32, n_heads=2, city_layers=2)
+CONFIGS = {
+    "small": SMALL,
+    "paper": DANConfig.paper(),
+    "official": DANConfig.official(),
+    "pruned": replace(SMALL, prune_visited=True),
+}
+
+
+@pytest.fixture(params=CONFIGS)
+def network(request):
+    torch.manual_seed(0)
+    return DAN(CONFIGS[request.param]).eval()
+
+
+def observation(batch=5, n=9, m=4, seed=0, dtype=torch.float32):
+    generator = torch.Generator().manual_seed(seed)
+    cities = torch.rand(batch, n, 2, generator=generator, dtype=torch.float64) * 2 - 1
+    agents = torch.rand(batch, m, 3, generator=generator, dtype=torch.float64)
+    visited = torch.rand(batch, n, generator=generator) < 0.4
+    visited[:, 0] = False
+    return cities.to(dtype), agents.to(dtype), visited
+
+
+def open_logits(network, cities, agents, visited):
+    """Logits at the nodes that may be picked, 0 elsewhere."""
+    return network(cities, agents, visited).masked_fill(visited, 0.0)
+
+
+def test_permuting_cities_permutes_logits(network):
+    cities, agents, visited = observation()
+    order = torch.cat([torch.zeros(1, dtype=torch.int64), torch.randperm(8) + 1])  # the depot has its own embedding
+    logits = open_logits(network, cities, agents, visited)
+    permuted = open_logits(network, cities[:, order], agents, visited[:, order])
+    assert torch.allclose(permuted, logits[:, order], atol=1e-5)
+    assert not torch.allclose(permuted, logits, atol=1e-3)
+
+
+def test_permuting_agents_changes_nothing(network):
+    cities, agents, visited = observation()
+    permuted = open_logits(network, cities, agents[:, torch.randperm(4)], visited)
+    assert torch.allclose(permuted, open_logits(network, cities, agents, visited), atol=1e-5)
+
+
+def test_agents_matter(network):
+    cities, agents, visited = observation()
+    assert not torch.allclose(network(cities, agents, visited), network(cities, agents + 0.5, visited), atol=1e-4)
+
+
+def test_a_batch_equals_its_rows_alone(network):
+    cities, agents, visited = observation()
+    together = open_logits(network, cities, agents, visited)
+    for row in range(5):
+        one = slice(row, row + 1)
+        alone = open_logits(network, cities[one], agents[one], visited[one])
+        assert torch.allclose(alone, together[one], atol=1e-5)
+
+
+def test_leading_dimensions_are_free(network):
+    cities, agents, visited = observation(batch=6)
+    flat = network(cities, agents, visited)
+    assert torch.allclose(network(cities[0], agents[0], visited[0]), flat[0], atol=1e-5) or network.config.prune_visited
+    shaped = network(cities.view(2, 3, 9, 2), agents.view(2, 3, 4, 3), visited.view(2, 3, 9))
+    assert torch.equal(shaped, flat.view(2, 3, 9))
+
+
+def test_float32_agrees_with_float64(network):
+    single = network(*observation())
+    double = network.double()(*observation(dtype=torch.float64))
+    assert torch.allclose(single.double(), double, atol=1e-4)
+
+
+def test_logits_stay_within_the_clip(network):
+    cities, agents, visited = observation()
+    assert network(cities * 100, agents * 100, visited).abs().max() <= network.config.tanh_clip
+
+
+def test_gradients_reach_every_parameter(network):
+    cities, agents, visited = observation()
+    (network(cities, agents, visited).masked_fill(visited, 0.0) ** 2).sum().backward()
+    for name, parameter in network.named_parameters():
+        assert parameter.grad is not None and parameter.grad.abs().max() > 0, name
+
+
+def test_the_glimpse_ignores_visited_cities_and_pruning_forgets_them():
+    cities, agents, visited = observation()
+    moved = torch.where(visited[:, :, None], cities + 0.3, cities)
+    torch.manual_seed(0)
+    pruned = DAN(CONFIGS["pruned"])
+    assert torch.allclose(open_logits(pruned, moved, agents, visited), open_logits(pruned, cities, agents, visited), atol=1e-5)
+    whole = DAN(SMALL)
+    whole.load_state_dict(pruned.state_dict())
+    assert not torch.allclose(open_logits(whole, moved, agents, visited), open_logits(whole, cities, agents, visited), atol=1e-4)
+    nothing = torch.zeros_like(visited)
+    assert torch.allclose(pruned(cities, agents, nothing), whole(cities, agents, nothing), atol=1e-5)
+
+
+def test_attention_layer_is_the_formula():
+    """Single head, post-norm, against the paper's equations written out."""
+    torch.manual_seed(0)
+    layer = AttentionLayer(8, 16, 1, "post").double()
+    query, source = torch.randn(2, 3, 8, dtype=torch.float64), torch.randn(2, 5, 8, dtype=torch.float64)
+    mask = torch.tensor([[True, True, False, True, True], [True] * 5])
+    w_k, w_v = layer.key_value.weight.chunk(2)
+    q, k, v = query @ layer.query.weight.T, source @ w_k.T, source @ w_v.T
+    u = (q @ k.transpose(1, 2) / 8**0.5).masked_fill(~mask[:, None], float("-inf"))
+    h = layer.norm_attention(query + u.softmax(-1) @ v @ layer.out.weight.T)
+    expected = layer.norm_feedforward(h + layer.feedforward(h))
+    assert torch.allclose(layer(query, source, mask), expected, atol=1e-12)
+
+
+def test_official_has_the_published_size():
+    assert sum(p.numel() for p in DAN(DANConfig.official()).parameters()) == pytest.approx(1.4e6, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"n_heads": 3}, "n_heads must divide embed_dim=128, got 3"),
+        ({"city_layers": 0}, "city_layers must be a whole number of at least 1, got 0"),
+        ({"encoder_norm": "batch"}, "unknown norm 'batch'"),
+        ({"tanh_clip": 0.0}, "tanh_clip must be above 0, got 0.0"),
+    ],
+)
+def test_bad_configurations_are_named(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        DANConfig(**kwargs)

@@ -1,0 +1,150 @@
+"""Actors, episodes and plans: any network plugs in, whole episodes come out, tours always solve the instance."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torchrl.envs import ExplorationType, set_exploration_type
+
+from benchmarks.policies.nearest import nearest
+from dan_policy import DAN, DANConfig, make_actor, rollout, solve
+from mtsp_env import Instance, check_tours, makespan, mtsp_v0, uniform
+from mtsp_env.batched import BatchedMTSP
+
+SMALL = DANConfig(embed_dim=16, feedforward_dim=32, n_heads=2, city_layers=1, prune_visited=True)
+
+
+@pytest.fixture(scope="module")
+def network():
+    torch.manual_seed(0)
+    return DAN(SMALL).eval()
+
+
+def test_visited_cities_get_probability_zero(network):
+    env = BatchedMTSP(12, 3, [8], seed=0)
+    actor, td = make_actor(network), env.reset()
+    for _ in range(6):
+        probability = actor.get_dist(td).probs
+        assert (probability[~td["action_mask"]] == 0).all()
+        assert torch.allclose(probability.sum(-1), torch.ones(8), atol=1e-6)
+        td = env.step(actor(td))["next"]
+
+
+def test_greedy_takes_the_likeliest_and_sampling_follows_the_softmax():
+    logits = torch.tensor([0.0, 2.0, 1.0, 9.0])
+    actor = make_actor(lambda cities, agents, visited: logits.expand(cities.shape[:-1]))
+    td = TensorDict(
+        {
+            "cities": torch.zeros(20_000, 4, 2),
+            "agents": torch.zeros(20_000, 1, 3),
+            "visited": torch.zeros(20_000, 4, dtype=torch.bool),
+            "action_mask": torch.tensor([True, True, True, False]).expand(20_000, 4),
+        },
+        batch_size=[20_000],
+    )
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert (actor(td.clone())["action"] == 1).all()
+    torch.manual_seed(0)
+    drawn = torch.bincount(actor(td)["action"], minlength=4) / 20_000
+    assert torch.allclose(drawn, torch.cat([logits[:3].softmax(0), torch.zeros(1)]), atol=0.02)
+
+
+@pytest.mark.parametrize("depot", ["open", "final"])
+def test_an_episode_holds_each_decision_once_and_nothing_after_its_end(network, depot):
+    env = BatchedMTSP(9, 3, [16], speed=0.1, depot=depot, seed=0)
+    torch.manual_seed(0)
+    episode = rollout(make_actor(network), env, "sample", keep=("visited", "action_mask"))
+    steps, batch = episode.valid.shape
+    assert episode.decisions.shape == (steps, batch)
+    assert episode.valid[0].all() and episode.valid[-1].any()
+    assert (episode.valid[:-1] | ~episode.valid[1:]).all()  # once over, always over
+    legal = episode.decisions["action_mask"].gather(2, episode.decisions["action"][..., None])[..., 0]
+    assert legal[episode.valid].all()
+    cities_taken = ((episode.decisions["action"] > 0) & episode.valid).sum(0)
+    assert (cities_taken == 8).all()
+    assert torch.allclose(episode.reward.double(), -env.makespan(episode.last), rtol=1e-6)
+
+
+def test_rollout_agrees_with_the_pettingzoo_environment(network):
+    """The same network, greedily, agent by agent in the AEC loop."""
+    instance = uniform(np.random.default_rng(0), 10, 3)
+    env = mtsp_v0.env(n_nodes=10, n_agents=3)
+    env.reset(options={"instance": instance})
+    for _ in env.agent_iter():
+        seen, _, terminated, truncated, info = env.last()
+        if terminated or truncated:
+            break
+        cities, agents, visited = (torch.as_tensor(seen["observation"][k])[None] for k in ("cities", "agents", "visited"))
+        logits = network(cities, agents, visited.bool())[0]
+        env.step(int(logits.masked_fill(~torch.as_tensor(seen["action_mask"]).bool(), float("-inf")).argmax()))
+    batched = BatchedMTSP(10, 3, [1])
+    episode = rollout(make_actor(network), batched, "greedy", torch.as_tensor(instance.nodes.copy())[None])
+    assert batched.tours(episode.last)[0] == info["tours"]
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(2, 12), st.integers(1, 15), st.integers(0, 2**31), st.sampled_from(["greedy", "sample"]), st.booleans())
+def test_a_plan_always_solves_the_instance(n_nodes, n_agents, seed, decode, coincide):
+    torch.manual_seed(seed)
+    nodes = np.random.default_rng(seed).random((n_nodes, 2))
+    instance = Instance(np.full_like(nodes, 0.5) if coincide else nodes, n_agents)
+    solution = solve(instance, DAN(SMALL), decode, samples=3, seed=seed)
+    check_tours(instance, solution.tours)
+    assert solution.makespan == makespan(instance.nodes, solution.tours)
+    assert solution.seconds > 0
+
+
+def test_seeded_plans_repeat_and_leave_the_global_generator_alone(network):
+    instance = uniform(np.random.default_rng(1), 15, 3)
+    before = torch.get_rng_state()
+    first, again, other = (solve(instance, network, "sample", samples=4, seed=s) for s in (1, 1, 2))
+    assert torch.equal(torch.get_rng_state(), before)
+    assert first.tours == again.tours and first.tours != other.tours
+    assert (first.method, solve(instance, network).method) == ("dan(s.4)", "dan(g.)")
+
+
+def test_more_samples_are_never_worse_than_the_first_of_them(network):
+    instance = uniform(np.random.default_rng(2), 15, 3)
+    costs = [solve(instance, network, "sample", samples=64, seed=seed).makespan for seed in range(3)]
+    singles = [solve(instance, network, "sample", samples=1, seed=seed).makespan for seed in range(8)]
+    assert max(costs) < np.mean(singles)
+
+
+def test_any_actor_can_plan():
+    instance = uniform(np.random.default_rng(3), 20, 4)
+    solution = solve(instance, make_actor(nearest))
+    check_tours(instance, solution.tours)
+
+
+def test_nearest_goes_to_the_nearest_in_both_faces():
+    """The plug-in of the README: a plain function as an actor, and the same rule in the AEC loop."""
+    instance = uniform(np.random.default_rng(4), 25, 3)
+    env = mtsp_v0.env(n_nodes=25, n_agents=3)
+    env.reset(options={"instance": instance})
+    for _ in env.agent_iter():
+        seen, _, terminated, truncated, info = env.last()
+        if terminated or truncated:
+            break
+        distance = np.linalg.norm(seen["observation"]["cities"], axis=1)
+        distance[(seen["action_mask"] == 0) | (np.arange(25) == 0)] = np.inf
+        env.step(int(distance.argmin()))
+    batched = BatchedMTSP(25, 3, [1])
+    episode = rollout(make_actor(nearest), batched, "greedy", torch.as_tensor(instance.nodes.copy())[None])
+    assert batched.tours(episode.last)[0] == info["tours"]
+    check_tours(instance, info["tours"])
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"decode": "beam"}, "unknown decode 'beam'"),
+        ({"samples": 0}, "samples must be a whole number of at least 1, got 0"),
+    ],
+)
+def test_bad_arguments_are_named(network, kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        solve(uniform(np.random.default_rng(0), 5, 2), network, **kwargs)
+    with pytest.raises(FileNotFoundError, match="no weights at nobody"):
+        solve(uniform(np.random.default_rng(0), 5, 2), "nobody")

@@ -1,0 +1,291 @@
+"""REINFORCE with a rollout baseline: the gradient is the formula, chunks add up, runs resume bit by bit and learn."""
+
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.objectives import ReinforceLoss
+
+from dan_policy import DANConfig, make_actor
+from train import checkpoint
+from train.__main__ import main
+from train.baseline import RolloutBaseline, better
+from train.collect import Instances, costs, draw, draw_set, play
+from train.config import PAPER, QUICK, ReinforceConfig, check_same_run
+from train.loss import EpisodicReinforceLoss, backward, decisions_with_advantage, log_probs
+from train.reinforce import Trainer, reinforce
+
+TINY = replace(
+    QUICK,
+    n_nodes=(5, 8),
+    n_agents=(1, 3),
+    batch_size=6,
+    network=DANConfig(embed_dim=16, feedforward_dim=32, n_heads=2, city_layers=1, prune_visited=True),
+    challenge_every=2,
+    challenge_instances=8,
+    validate_every=2,
+    validation_instances=8,
+    checkpoint_every=2,
+    steps=6,
+    tensorboard=False,
+)
+
+
+class Preferences(nn.Module):
+    """One logit per node, whatever the observation: small enough to differentiate by hand."""
+
+    def __init__(self, logits):
+        super().__init__()
+        self.logits = nn.Parameter(torch.tensor(logits))
+
+    def forward(self, cities, agents, visited):
+        return self.logits.expand(cities.shape[:-1])
+
+
+def gradients(network, decisions, n_episodes, chunk):
+    network.zero_grad()
+    loss = backward(EpisodicReinforceLoss(make_actor(network), n_episodes), decisions, chunk)
+    return loss, [p.grad.clone() for p in network.parameters()]
+
+
+def test_the_gradient_is_reinforce_by_hand():
+    """Three cities, one agent: three decisions, the last one forced. p1 = p2 = p3 = 1/3, then 1/2 each."""
+    network = Preferences([0.0, 0.0, 0.0, 0.0])
+    nodes = torch.tensor([[0.5, 0.5], [0.1, 0.2], [0.9, 0.3], [0.4, 0.8]], dtype=torch.float64).expand(2, 4, 2)
+    config = replace(TINY, n_nodes=(4, 4))
+    episode = play(network, Instances(nodes, 1), config, "sample", keep=True)
+    episode.decisions["action"].copy_(torch.tensor([[1, 3], [2, 1], [3, 2]]))
+    masks = torch.tensor([[[0, 1, 1, 1], [0, 0, 1, 1], [0, 0, 0, 1]], [[0, 1, 1, 1], [0, 1, 1, 0], [0, 0, 1, 0]]]).bool()
+    episode.decisions["action_mask"].copy_(masks.transpose(0, 1))
+
+    advantage = torch.tensor([2.0, -1.0])
+    loss, (gradient,) = gradients(network, decisions_with_advantage(episode, advantage), 2, chunk=100)
+    # episode 1 visits 1, 2, 3: d log p = (1 - 1/3, 0 - 1/3 + 1 - 1/2, 0 - 1/3 - 1/2) for cities 1, 2, 3
+    first = torch.tensor([0.0, 2 / 3, 1 / 6, -5 / 6])
+    # episode 2 visits 3, 1, 2
+    second = torch.tensor([0.0, 1 / 6, -5 / 6, 2 / 3])
+    assert torch.allclose(gradient, -(2.0 * first - 1.0 * second) / 2, atol=1e-6)
+    assert loss == pytest.approx(-(2.0 - 1.0) * np.log(1 / 6) / 2, rel=1e-6)
+
+
+def test_padding_after_an_episodes_end_contributes_nothing():
+    torch.manual_seed(0)
+    config = replace(TINY, depot="final", n_nodes=(6, 6), n_agents=(4, 4), batch_size=32)
+    network = Preferences([0.5, 0.0, 0.1, 0.2, 0.3, 0.4])
+    episode = play(network, draw(np.random.default_rng(0), config, 32), config, "sample", keep=True)
+    assert not episode.valid.all(), "the case has episodes of several lengths"
+    advantage = torch.randn(32)
+    _, whole = gradients(network, decisions_with_advantage(episode, advantage), 32, 1000)
+    scrambled = replace(episode, decisions=episode.decisions.clone())
+    scrambled.decisions["action"][~episode.valid] = 1
+    scrambled.decisions["action_mask"][~episode.valid] = True
+    _, same = gradients(network, decisions_with_advantage(scrambled, advantage), 32, 1000)
+    alone = []
+    for row in range(32):
+        length = int(episode.valid[:, row].sum())
+        part = episode.decisions[:length, row].set("advantage", advantage[row].expand(length))
+        alone.append(gradients(network, part, 32, 1000)[1][0])
+    assert torch.equal(whole[0], same[0])
+    assert torch.allclose(whole[0], sum(alone), atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def trainer():
+    return Trainer(replace(TINY, batch_size=16))
+
+
+@pytest.fixture
+def decisions(trainer):
+    torch.manual_seed(0)
+    instances = draw(np.random.default_rng(0), trainer.config, 16)
+    episode = play(trainer.network, instances, trainer.config, "sample", keep=True)
+    return decisions_with_advantage(episode, torch.randn(16))
+
+
+@pytest.mark.parametrize("chunk", [1, 7, 50])
+def test_chunks_add_up_to_the_whole(trainer, decisions, chunk):
+    loss, whole = gradients(trainer.network, decisions, 16, len(decisions))
+    chunked_loss, chunked = gradients(trainer.network, decisions, 16, chunk)
+    assert chunked_loss == pytest.approx(loss, abs=1e-5)
+    for a, b in zip(whole, chunked, strict=True):
+        assert torch.allclose(a, b, atol=1e-5)
+
+
+def test_the_loss_is_torchrls_reinforce_loss_with_another_average(trainer, decisions):
+    class NoCritic(nn.Module):
+        def forward(self, cities):
+            return cities.sum((-2, -1))[..., None] * 0
+
+    critic = TensorDictModule(NoCritic(), ["cities"], ["state_value"])
+    theirs = ReinforceLoss(make_actor(trainer.network), critic, reduction="sum", functional=False)
+    batch = decisions.clone().set("value_target", torch.zeros(len(decisions), 1))
+    batch["advantage"] = batch["advantage"][:, None]
+    ours = EpisodicReinforceLoss(make_actor(trainer.network), 16)(decisions)["loss_actor"]
+    assert torch.allclose(ours, theirs(batch)["loss_actor"] / 16, rtol=1e-5)
+    assert EpisodicReinforceLoss(make_actor(trainer.network), 16).in_keys == [
+        "cities", "agents", "visited", "action_mask", "action", "advantage",
+    ]  # fmt: skip
+
+
+def test_recomputed_log_probabilities_are_those_that_were_sampled_from(trainer, decisions):
+    probability = make_actor(trainer.network).get_dist(decisions).probs.gather(1, decisions["action"][:, None])[:, 0]
+    assert torch.allclose(log_probs(make_actor(trainer.network), decisions), probability.log(), atol=1e-5)
+    assert (log_probs(make_actor(trainer.network), decisions) <= 0).all()
+
+
+def test_challenge_is_a_one_sided_paired_t_test():
+    rng = np.random.default_rng(0)
+    base = torch.as_tensor(rng.random(200))
+    noise = torch.as_tensor(rng.normal(0, 0.1, 200))
+    assert better(base - 0.05 + noise, base, 0.05)
+    assert not better(base + 0.05 + noise, base, 0.05)
+    assert not better(base - 0.001 + noise - noise.mean(), base, 0.05)
+    assert not better(base, base, 0.05)
+    assert better(base - 1.0, base, 0.05)
+
+
+def test_the_baseline_changes_only_when_beaten_and_then_draws_a_new_test_set(monkeypatch):
+    rng = np.random.default_rng(0)
+    good, bad = Preferences([-20.0] + [0.0] * 7), Preferences([20.0] + [0.0] * 7)  # the bad one goes home early
+    config = replace(TINY, n_nodes=(8, 8), n_agents=(3, 3), challenge_instances=64)
+    baseline = RolloutBaseline(bad, config, rng)
+    instances = draw(rng, config, 10)
+    assert torch.equal(baseline.value(instances), play(bad, instances, config, "greedy").reward)
+    first_set = baseline.test_set[0].nodes
+    assert baseline.challenge(good) and not torch.equal(baseline.test_set[0].nodes, first_set)
+    assert torch.equal(baseline.value(instances), play(good, instances, config, "greedy").reward)
+    second_set = baseline.test_set[0].nodes
+    assert not baseline.challenge(bad) and torch.equal(baseline.test_set[0].nodes, second_set)
+
+
+def test_drawn_sizes_cover_their_ranges():
+    rng = np.random.default_rng(0)
+    sizes = {(part.nodes.shape[1], part.n_agents) for part in (draw(rng, TINY, 2) for _ in range(200))}
+    assert sizes == {(n, m) for n in range(5, 9) for m in range(1, 4)}
+    assert sum(len(part.nodes) for part in draw_set(rng, TINY, 21)) == 21
+
+
+def same(a, b):
+    """Deep equality, to the bit."""
+    if isinstance(a, torch.Tensor):
+        return torch.equal(a, b)
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, (list, tuple)):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    return a == b
+
+
+def test_resume_is_bit_identical(tmp_path):
+    reinforce(replace(TINY, out=tmp_path / "whole"))
+    reinforce(replace(TINY, out=tmp_path / "parts", steps=3))
+    torch.manual_seed(123)  # whatever happened in between
+    reinforce(replace(TINY, out=tmp_path / "parts", resume=True))
+    whole, parts = (checkpoint.read(tmp_path / name / "checkpoint.pt") for name in ("whole", "parts"))
+    for key in ("network", "optimiser", "schedule", "baseline", "random"):
+        assert same(whole[key], parts[key]), key
+    for key in ("step", "instances", "best"):
+        assert whole["progress"][key] == parts["progress"][key], key
+
+
+def test_an_interrupt_finishes_the_step_and_saves(tmp_path, monkeypatch):
+    def step_then_interrupt(self):
+        logs = train_step(self)
+        if self.step == 3:
+            signal.raise_signal(signal.SIGINT)
+        return logs
+
+    train_step = Trainer.train_step
+    monkeypatch.setattr(Trainer, "train_step", step_then_interrupt)
+    before = signal.getsignal(signal.SIGINT)
+    assert reinforce(replace(TINY, out=tmp_path, checkpoint_every=1000)).step == 3
+    assert checkpoint.read(tmp_path / "checkpoint.pt")["progress"]["step"] == 3
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_run_is_not_overwritten_nor_resumed_as_another(tmp_path):
+    reinforce(replace(TINY, out=tmp_path, steps=1))
+    with pytest.raises(FileExistsError, match="give --resume"):
+        reinforce(replace(TINY, out=tmp_path))
+    with pytest.raises(ValueError, match="batch_size was 6, is 7"):
+        reinforce(replace(TINY, out=tmp_path, resume=True, batch_size=7))
+    with pytest.raises(FileNotFoundError, match="no checkpoint at"):
+        reinforce(replace(TINY, out=tmp_path / "other", resume=True))
+    check_same_run(TINY.to_dict(), replace(TINY, steps=99, seconds=1.0))
+
+
+def test_a_damaged_checkpoint_is_refused(tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    checkpoint.write(path, {"a": torch.zeros(1000)})
+    path.write_bytes(path.read_bytes()[:500])
+    with pytest.raises(ValueError, match="not a checkpoint, or a damaged one"):
+        checkpoint.read(path)
+
+
+def test_logs_and_weights_are_left_behind(tmp_path):
+    trainer = reinforce(replace(TINY, out=tmp_path, tensorboard=True))
+    cost = np.loadtxt(tmp_path / "logs/scalars/cost.csv", delimiter=",")
+    assert cost[:, 0].tolist() == [1, 2, 3, 4, 5, 6]
+    assert {p.name for p in tmp_path.glob("*.safetensors")} == {"best.safetensors", "last.safetensors"}
+    assert list(tmp_path.glob("tensorboard/events*"))
+    continued = Trainer(replace(TINY, init=str(tmp_path / "last.safetensors")))
+    assert same(dict(continued.network.state_dict()), dict(trainer.network.state_dict()))
+
+
+def test_training_lowers_the_greedy_cost_on_held_out_instances(tmp_path):
+    """A minute of training in small: 200 steps at n = 10, m = 2."""
+    config = replace(
+        TINY, out=tmp_path, n_nodes=(10, 10), n_agents=(2, 2), batch_size=64, steps=200, seed=1, learning_rate=1e-3,
+        network=DANConfig(embed_dim=64, feedforward_dim=128, n_heads=4, city_layers=1, prune_visited=True),
+        challenge_every=20, challenge_instances=128, validate_every=1000, checkpoint_every=1000,
+    )  # fmt: skip
+    held_out = draw_set(np.random.default_rng(77), config, 256)
+    before = costs(Trainer(config).network, held_out, config)
+    after = costs(reinforce(config).network, held_out, config)
+    assert better(after, before, 1e-6)
+    assert after.mean() < 0.8 * before.mean()
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"n_nodes": (1, 5)}, r"n_nodes\[0\] must be a whole number of at least 2, got 1"),
+        ({"n_agents": (3, 2)}, r"n_agents\[1\] must be a whole number of at least 3, got 2"),
+        ({"batch_size": 0}, "batch_size must be a whole number of at least 1, got 0"),
+        ({"learning_rate": 0.0}, "learning_rate must be above 0"),
+        ({"challenge_p": 1.0}, "challenge_p must lie between 0 and 1"),
+        ({"distribution": "normal"}, "unknown distribution 'normal'"),
+    ],
+)
+def test_bad_configurations_are_named(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        ReinforceConfig(**kwargs)
+
+
+def test_presets_follow_the_paper():
+    assert (PAPER.n_nodes, PAPER.n_agents, PAPER.speed, PAPER.batch_size) == ((20, 100), (5, 10), 0.1, 8)
+    assert (PAPER.learning_rate, PAPER.decay, PAPER.decay_every, PAPER.depot) == (1e-5, 0.96, 1024, "open")
+
+
+def test_the_command_line_trains_and_reports_bad_input(tmp_path, capsys):
+    small = ["--n-nodes", "5", "6", "--batch-size", "4", "--network.embed-dim", "16", "--challenge-instances", "4",
+             "--validation-instances", "4", "--out", str(tmp_path), "--no-tensorboard"]  # fmt: skip
+    assert main(["reinforce", "quick", "--steps", "2", *small]) == 0
+    assert main(["reinforce", "quick", "--steps", "2", *small]) == 2
+    assert "give --resume" in capsys.readouterr().err
+    assert main(["reinforce", "quick", "--steps", "3", "--resume", *small]) == 0
+    assert checkpoint.read(tmp_path / "checkpoint.pt")["progress"]["step"] == 3
+
+
+def test_precision_is_a_setting():
+    config = replace(TINY, precision="bfloat16")
+    trainer = Trainer(config)
+    logs = trainer.train_step()
+    assert np.isfinite(logs["grad_norm"]) and logs["grad_norm"] > 0
+    instances = Instances(torch.rand(4, 6, 2, dtype=torch.float64), 2)
+    wide = play(trainer.network, instances, replace(config, precision="float32"), "greedy").reward
+    assert wide.dtype == torch.float32

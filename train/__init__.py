@@ -1,0 +1,1 @@
+"""Training of policies for the MinMax mTSP; run from a checkout as ``python -m train``."""

@@ -1,0 +1,37 @@
+"""``python -m train reinforce {paper,quick} [options]``."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import tyro
+
+from train.config import PRESETS
+from train.reinforce import reinforce
+
+Preset = tyro.extras.subcommand_type_from_defaults(
+    {name: preset for name, (_, preset) in PRESETS.items()},
+    {name: description for name, (description, _) in PRESETS.items()},
+)
+app = tyro.extras.SubcommandApp()
+
+
+@app.command(name="reinforce")
+def reinforce_command(config: Annotated[Preset, tyro.conf.arg(name="")]) -> None:
+    """Train a DAN by REINFORCE with a greedy rollout baseline, from a preset with any option changed."""
+    reinforce(config)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Parse the command line and train. Exit code 2 and one line on bad input."""
+    try:
+        app.cli(prog="python -m train", args=argv)
+    except (ValueError, OSError) as error:
+        print(f"train: error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
