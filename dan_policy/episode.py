@@ -75,3 +75,18 @@ def rollout(
             reward += torch.where(over, 0.0, td["reward"][..., 0])
             over = over | td["done"][..., 0]
     return Episode(torch.stack(kept) if kept else None, torch.stack(valid), reward, td)
+
+
+def find_device(device: torch.device | str | None = None) -> torch.device:
+    """The device of that name; None takes a GPU where there is one.
+
+    Raises:
+        ValueError: no such device, or none here.
+    """
+    try:
+        found = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        torch.empty(0, device=found)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"no device {str(device)!r} here; choose for example 'cpu' or 'cuda' ({reason})") from error
+    return found

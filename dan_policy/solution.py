@@ -12,7 +12,7 @@ from torch import nn
 
 from dan_policy.actor import make_actor
 from dan_policy.network import DAN
-from dan_policy.episode import Decode, rollout
+from dan_policy.episode import Decode, find_device, rollout
 from dan_policy.weights import find, load
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.instance import Instance, Tours, check_count
@@ -66,7 +66,7 @@ def solve(
     check_count("samples", samples, minimum=1)
     if decode not in ("greedy", "sample"):
         raise ValueError(f"unknown decode {decode!r}; choose from ['greedy', 'sample']")
-    device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    device = find_device(device)
     sharp = decode == "sample" and instance.n_nodes >= SHARP_FROM
     actor = _actor(policy, device, sharp)
 

@@ -39,17 +39,17 @@ class Instance:
     scale: float = 1.0
 
     def __post_init__(self) -> None:
-        try:
-            nodes = np.array(self.nodes, dtype=np.float64)  # a copy, so that nobody changes it from outside
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"nodes must be numbers of shape (n, 2), got {type(self.nodes).__name__}") from error
+        nodes = _numbers("nodes", self.nodes) + 0.0  # a copy nobody changes from outside; -0.0 becomes 0.0
+        if nodes.ndim != 2:
+            raise ValueError(f"nodes must have shape (n, 2), got {nodes.shape}")
         check_nodes(nodes)
         check_count("n_agents", self.n_agents, minimum=1)
-        if not (math.isfinite(self.scale) and self.scale > 0):
-            raise ValueError(f"scale must be a finite number above 0, got {self.scale!r}")
+        if not isinstance(self.name, str):
+            raise ValueError(f"name must be a string, got {self.name!r}")
         nodes.flags.writeable = False
         object.__setattr__(self, "nodes", nodes)
         object.__setattr__(self, "n_agents", int(self.n_agents))
+        object.__setattr__(self, "scale", _check_scale(self.scale))
 
     @property
     def n_nodes(self) -> int:
@@ -64,8 +64,28 @@ class Instance:
             and (self.n_agents, self.name, self.scale) == (other.n_agents, other.name, other.scale)
         )
 
+    def __reduce__(self) -> tuple:
+        return Instance, (self.nodes, self.n_agents, self.name, self.scale)  # NumPy unpickles arrays as writable
+
     def __hash__(self) -> int:
         return hash((self.nodes.tobytes(), self.n_agents, self.name, self.scale))
+
+
+def _numbers(name: str, values: object) -> np.ndarray:
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{name} must be numbers of shape (n, 2), got {type(values).__name__}: {error}") from error
+
+
+def _check_scale(scale: float) -> float:
+    try:
+        value = float(scale)
+    except (TypeError, ValueError, OverflowError):
+        value = math.nan
+    if isinstance(scale, str) or not (math.isfinite(value) and value > 0):
+        raise ValueError(f"scale must be a finite number above 0, got {scale!r}")
+    return value
 
 
 def check_nodes(nodes: np.ndarray) -> None:
@@ -95,7 +115,7 @@ def from_coordinates(xy: np.ndarray | Sequence, n_agents: int, name: str = "") -
     Raises:
         ValueError: fewer than two points, not of shape (n, 2), or not finite.
     """
-    xy = np.asarray(xy, dtype=np.float64)
+    xy = _numbers("coordinates", xy)
     if xy.ndim != 2 or xy.shape[1] != 2:
         raise ValueError(f"coordinates must have shape (n, 2), got {xy.shape}")
     check_count("n_nodes", len(xy), minimum=2)
@@ -183,7 +203,10 @@ def read_instance(path: str | os.PathLike, n_agents: int | None = None) -> Insta
     """
     data = _read_json(path, keys=("nodes", "n_agents"))
     m = data["n_agents"] if n_agents is None else n_agents
-    return Instance(data["nodes"], m, data.get("name", ""), data.get("scale", 1.0))
+    try:
+        return Instance(data["nodes"], m, data.get("name", ""), data.get("scale", 1.0))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
 
 
 def write_tours(path: str | os.PathLike, tours: Tours, **extra: object) -> None:
@@ -219,7 +242,7 @@ def _write_json(path: str | os.PathLike, data: dict) -> None:
 def _read_json(path: str | os.PathLike, keys: Sequence[str]) -> dict:
     try:
         data = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # not JSON, not text, or nested without end
         raise ValueError(f"{path}: not a JSON file ({error})") from error
     if not isinstance(data, dict) or not set(keys) <= data.keys():
         raise ValueError(f"{path}: expected a JSON object with the keys {list(keys)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from typing import Any
 
 import numpy as np
@@ -70,11 +71,12 @@ class raw_env(AECEnv, EzPickle):
         self.distribution, self.render_mode = distribution, render_mode
 
         self.possible_agents = [f"agent_{i}" for i in range(n_agents)]
-        self._index = {name: i for i, name in enumerate(self.possible_agents)}
+        self._index = {name: np.array([i]) for i, name in enumerate(self.possible_agents)}  # (B,) = (1,), for the rules
         self.observation_spaces = {a: _observation_space(n_nodes, n_agents) for a in self.possible_agents}
         self.action_spaces = {a: spaces.Discrete(n_nodes) for a in self.possible_agents}
         self.state_space = spaces.Box(0.0, np.float32(3e38), (3 * n_nodes + 4 * n_agents,), np.float32)
         self._rng = np.random.default_rng()
+        self._legal: np.ndarray | None = None  # (n,) the deciding agent's mask, once it is known
         self._viewer = None
         self.agents: list[str] = []
 
@@ -93,6 +95,8 @@ class raw_env(AECEnv, EzPickle):
             ValueError: the instance has another n or m than this environment.
         """
         instance = options.get("instance") if isinstance(options, dict) else None
+        if instance is not None and not isinstance(instance, Instance):
+            raise ValueError(f"options['instance'] must be an Instance, got {type(instance).__name__}")
         if instance is not None and (instance.n_nodes, instance.n_agents) != (self.n_nodes, self.n_agents):
             raise ValueError(
                 f"the instance has n_nodes={instance.n_nodes}, n_agents={instance.n_agents}, this environment "
@@ -105,6 +109,7 @@ class raw_env(AECEnv, EzPickle):
             instance = Instance(nodes, self.n_agents, self.distribution)
         self.instance = instance
         self.game = rules.start(instance.nodes[None], self.n_agents)
+        self._legal = None
 
         self.agents = list(self.possible_agents)
         self.agent_selection = self.agents[0]
@@ -118,7 +123,9 @@ class raw_env(AECEnv, EzPickle):
 
     def observe(self, agent: str) -> dict:
         """What ``agent`` sees now; an agent underway sees the world from its destination."""
-        seen = rules.observe(self.game, self.rules, np.array([self._index[agent]]))
+        seen = rules.observe(self.game, self.rules, self._index[agent])
+        if agent == self.agent_selection:
+            self._legal = seen.action_mask[0]  # step() checks against it
         return {
             "observation": {
                 "cities": seen.cities[0],
@@ -141,7 +148,8 @@ class raw_env(AECEnv, EzPickle):
         before, self.game = self.game, rules.depart(self.game, self.rules, np.array([action]))
 
         self._cumulative_rewards[self.agent_selection] = 0.0
-        self.agent_selection = self.possible_agents[int(self.game.agent[0])]
+        self.agent_selection = self.possible_agents[self.game.agent[0]]
+        self._legal = None
         terminated = bool(rules.all_visited(self.game)[0])
         truncated = not terminated and int(self.game.decisions[0]) >= self.rules.max_decisions
         if terminated or truncated or self.rules.reward == "shaped":
@@ -161,13 +169,18 @@ class raw_env(AECEnv, EzPickle):
 
     def _check_action(self, action: int | None) -> int:
         name = self.agent_selection
-        if action is None or int(action) != action or not 0 <= action < self.n_nodes:
+        try:
+            node = operator.index(action)
+        except TypeError:  # None, a float, an array, ...
+            node = -1
+        if not 0 <= node < self.n_nodes:
             raise ValueError(f"{name} must pick a node in 0..{self.n_nodes - 1}, got {action!r}")
-        action = int(action)
-        if not rules.legal_actions(self.game, self.rules, self.game.agent)[0, action]:
-            why = "is not open to it now" if action == 0 else "is visited already"
-            raise ValueError(f"{name} may not go to node {action}: it {why}; see action_mask")
-        return action
+        if self._legal is None:
+            self._legal = rules.legal_actions(self.game, self.rules, self.game.agent)[0]
+        if not self._legal[node]:
+            why = "is not open to it now" if node == 0 else "is visited already"
+            raise ValueError(f"{name} may not go to node {node}: it {why}; see action_mask")
+        return node
 
     @property
     def tours(self) -> Tours:
@@ -181,7 +194,7 @@ class raw_env(AECEnv, EzPickle):
         return int(self.game.ready[0].min())
 
     def state(self) -> np.ndarray:
-        """The whole state, float32 (3 n + 4 m,): nodes (x, y), visited; destination (x, y), g, tour length per agent."""
+        """All there is, float32 (3 n + 4 m,): x, y, visited of each node; destination x, y, g, tour length of each agent."""
         game, m = self.game, self.n_agents
         seen = rules.observe(game, self.rules)
         per_node = np.concatenate([game.nodes[0], rules.visited(game)[0][:, None]], axis=1)

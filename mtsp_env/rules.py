@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -70,7 +71,7 @@ class State(NamedTuple):
     """A batch of games. Lengths are float64, ticks and indices int64."""
 
     nodes: Array  # (B, n, 2)  coordinates; row 0 is the depot
-    visits: Array  # (B, n)    who visited a city and when, as `_visit_code` packs it; -1: not visited (the depot: always)
+    visits: Array  # (B, n)    who visited a city and when, see `_visit_code`; -1: not visited (the depot: always)
     destination: Array  # (B, m)  node that an agent stands at or heads for
     leg: Array  # (B, m)       length of its current leg
     departed: Array  # (B, m)  tick at which it set off on that leg
@@ -91,7 +92,7 @@ class Observation(NamedTuple):
 
 def start(nodes: Array, n_agents: int) -> State:
     """All agents at the depot at tick 0, no city visited; ``nodes`` is float64 (B, n, 2)."""
-    xp, on = array_namespace(nodes), device(nodes)
+    xp, on = _library(nodes)
     batch, n_nodes = nodes.shape[0], nodes.shape[1]
 
     def zeros(*shape, dtype=xp.int64):
@@ -112,7 +113,12 @@ def start(nodes: Array, n_agents: int) -> State:
 
 def agent_to_decide(ready: Array) -> Array:
     """(B,) The agent with the smallest (ready tick, index); argmin returns the first of equals."""
-    return array_namespace(ready).argmin(ready, axis=1)
+    return ready.argmin(1)
+
+
+def now(state: State) -> Array:
+    """(B,) int64: the clock, the tick of the decision at hand."""
+    return _pick(state.ready, state.agent)
 
 
 def visited(state: State) -> Array:
@@ -122,7 +128,7 @@ def visited(state: State) -> Array:
 
 def all_visited(state: State) -> Array:
     """(B,) bool: the game is over, all agents terminate at once."""
-    return array_namespace(state.visits).all(state.visits[:, 1:] >= 0, axis=1)
+    return (state.visits[:, 1:] >= 0).all(1)
 
 
 def legal_actions(state: State, rules: Rules, agent: Array) -> Array:
@@ -132,17 +138,15 @@ def legal_actions(state: State, rules: Rules, agent: Array) -> Array:
     "final": not before the agent's first city, nor by the last agent still out while cities remain.
     When every city is visited only the depot is legal, so a mask is never empty.
     """
-    xp = array_namespace(state.nodes)
-    unvisited = state.visits < 0
+    mask = state.visits < 0  # (B, n)
     if rules.depot == "open":
-        now = xp.min(state.ready, axis=1)[:, None]
-        stands_at_depot = (state.destination == 0) & ((state.leg == 0) | (state.ready <= now))
-        depot = ~xp.all(stands_at_depot, axis=1)
+        underway = (state.leg > 0) & (state.ready > now(state)[:, None])
+        depot = ((state.destination != 0) | underway).any(1)
     else:
-        has_left = state.destination[_rows(xp, agent), agent] != 0
-        depot = has_left & (xp.sum(xp.astype(state.ready < NEVER, xp.int64), axis=1) > 1)
-    depot = depot | ~xp.any(unvisited[:, 1:], axis=1)
-    return xp.concat([depot[:, None], unvisited[:, 1:]], axis=1)
+        has_left = _pick(state.destination, agent) != 0
+        depot = has_left & ((state.ready < NEVER).sum(1) > 1)
+    mask[:, 0] = depot | ~mask[:, 1:].any(1)
+    return mask
 
 
 def observe(state: State, rules: Rules, agent: Array | None = None) -> Observation:
@@ -151,22 +155,20 @@ def observe(state: State, rules: Rules, agent: Array | None = None) -> Observati
     Algorithm 1 lowers g inside the loop over agents, so agent i sees the agents before it (j < i) one tick further on.
     An agent underway sees the world from its destination, where it will decide next; a decider's own row is (0, 0, 0).
     """
-    xp, on = array_namespace(state.nodes), device(state.nodes)
+    xp, _ = _library(state.nodes)
     agent = state.agent if agent is None else agent
-    rows = _rows(xp, agent)
-    position = state.nodes[rows, state.destination[rows, agent]][:, None, :]  # (B, 1, 2)
-    heading = state.nodes[rows[:, None], state.destination] - position  # (B, m, 2)
+    position = _pick(state.nodes, _pick(state.destination, agent))[:, None]  # (B, 1, 2)
+    cities = xp.astype(state.nodes - position, xp.float32)  # (B, n, 2)
+    heading = _pick_many(cities, state.destination)  # (B, m, 2)
 
-    now = xp.min(state.ready, axis=1)[:, None]
-    before = xp.arange(state.ready.shape[1], device=on) < agent[:, None]  # (B, m): j < i
-    elapsed = now - state.departed + xp.astype(before, xp.int64)
-    remaining = state.leg - rules.speed * xp.astype(elapsed, xp.float64)
-    remaining = xp.where((remaining > 0) & (elapsed < state.ready - state.departed), remaining, 0.0)
+    before = _indices(state.ready, axis=1) < agent[:, None]  # (B, m): j < i
+    tick = now(state)[:, None] + before  # (B, m)
+    elapsed = xp.astype(tick - state.departed, xp.float64) + TICK_TOLERANCE
+    remaining = (state.leg - rules.speed * elapsed).clip(0.0)
 
-    agents = xp.concat([heading, remaining[:, :, None]], axis=2)
     return Observation(
-        cities=xp.astype(state.nodes - position, xp.float32),
-        agents=xp.astype(agents, xp.float32),
+        cities=cities,
+        agents=xp.concat([heading, xp.astype(remaining, xp.float32)[:, :, None]], axis=2),
         visited=visited(state),
         action_mask=legal_actions(state, rules, agent),
     )
@@ -178,31 +180,22 @@ def depart(state: State, rules: Rules, action: Array) -> State:
     The caller has checked that the actions are legal. In a finished game only the depot is left to pick, which changes
     neither the makespan nor the tours.
     """
-    xp, on = array_namespace(state.nodes), device(state.nodes)
-    rows, agent = _rows(xp, action), state.agent
-    n_nodes, n_agents = state.visits.shape[1], state.ready.shape[1]
-
-    here, now = state.destination[rows, agent], state.ready[rows, agent]
-    step = state.nodes[rows, action] - state.nodes[rows, here]  # (B, 2)
-    leg = xp.sqrt(step[:, 0] * step[:, 0] + step[:, 1] * step[:, 1])
-    arrival = now + travel_ticks(leg, rules.speed)
+    agent, here, tick = state.agent, _pick(state.destination, state.agent), now(state)
+    leg = _norm(_pick(state.nodes, action) - _pick(state.nodes, here))
+    arrival = tick + travel_ticks(leg, rules.speed)
     if rules.depot == "final":
-        arrival = xp.where(action == 0, NEVER, arrival)
-
-    mine = xp.arange(n_agents, device=on) == agent[:, None]  # (B, m)
-    city = xp.where(action == 0, -1, action)  # the depot is never marked
-    marked = xp.arange(n_nodes, device=on) == city[:, None]  # (B, n)
-    code = _visit_code(state.decisions, agent, here == 0, n_agents)
-
-    ready = xp.where(mine, arrival[:, None], state.ready)
+        arrival = _library(arrival)[0].where(action == 0, NEVER, arrival)
+    visits = _put(state.visits, action, _visit_code(state.decisions, agent, here == 0, state.ready.shape[1]))
+    visits[:, 0] = -1  # the depot is never marked
+    ready = _put(state.ready, agent, arrival)
     return State(
         nodes=state.nodes,
-        visits=xp.where(marked, code[:, None], state.visits),
-        destination=xp.where(mine, action[:, None], state.destination),
-        leg=xp.where(mine, leg[:, None], state.leg),
-        departed=xp.where(mine, now[:, None], state.departed),
+        visits=visits,
+        destination=_put(state.destination, agent, action),
+        leg=_put(state.leg, agent, leg),
+        departed=_put(state.departed, agent, tick),
         ready=ready,
-        length=state.length + xp.where(mine, leg[:, None], 0.0),
+        length=_put(state.length, agent, _pick(state.length, agent) + leg),
         decisions=state.decisions + 1,
         agent=agent_to_decide(ready),
     )
@@ -210,25 +203,20 @@ def depart(state: State, rules: Rules, action: Array) -> State:
 
 def travel_ticks(leg: Array, speed: float) -> Array:
     """Ticks that a leg takes: max(1, ceil(leg / speed)), int64. A stay takes one tick."""
-    xp = array_namespace(leg)
-    ticks = xp.astype(xp.ceil(leg / speed - TICK_TOLERANCE), xp.int64)
-    return xp.where(ticks > 1, ticks, 1)
+    xp, _ = _library(leg)
+    return xp.astype(xp.ceil(leg / speed - TICK_TOLERANCE).clip(1.0), xp.int64)
 
 
 def makespan(state: State) -> Array:
     """(B,) float64: the longest tour so far, every agent's return leg counted."""
-    xp = array_namespace(state.nodes)
-    rows = _rows(xp, state.decisions)[:, None]
-    home = state.nodes[rows, state.destination] - state.nodes[:, :1, :]  # (B, m, 2)
-    back = xp.sqrt(home[:, :, 0] * home[:, :, 0] + home[:, :, 1] * home[:, :, 1])
-    return xp.max(state.length + back, axis=1)
+    back = _norm(_pick_many(state.nodes, state.destination) - state.nodes[:, :1, :])  # (B, m)
+    return _library(back)[0].max(state.length + back, axis=1)
 
 
 def unvisited_trips(state: State) -> Array:
     """(B,) float64: out-and-back trips to all unvisited cities; what truncation adds, so that stalling never pays."""
-    xp = array_namespace(state.nodes)
-    home = state.nodes - state.nodes[:, :1, :]
-    trips = 2.0 * xp.sqrt(home[:, :, 0] * home[:, :, 0] + home[:, :, 1] * home[:, :, 1])  # (B, n)
+    xp, _ = _library(state.nodes)
+    trips = 2.0 * _norm(state.nodes - state.nodes[:, :1, :])  # (B, n)
     return xp.sum(xp.where(state.visits < 0, trips, 0.0), axis=1)
 
 
@@ -239,21 +227,70 @@ def truncated(state: State, rules: Rules) -> Array:
 
 def final_cost(state: State, rules: Rules) -> Array:
     """(B,) float64: the makespan, plus ``unvisited_trips`` where the game was cut off; minus an episode's rewards."""
-    xp = array_namespace(state.nodes)
-    return makespan(state) + xp.where(truncated(state, rules), unvisited_trips(state), 0.0)
+    cut_off = state.decisions >= rules.max_decisions  # with no city left there are no trips to add
+    return makespan(state) + _library(state.nodes)[0].where(cut_off, unvisited_trips(state), 0.0)
 
 
 def reward(before: State, after: State, rules: Rules) -> Array:
     """(B,) float64: what the decision between two states pays to every agent alike (paper, Sec. 4, Reward)."""
-    xp = array_namespace(after.nodes)
+    cost = final_cost(after, rules)
     if rules.reward == "shaped":
-        return makespan(before) - final_cost(after, rules)
-    over = all_visited(after) | truncated(after, rules)
-    return xp.where(over, -final_cost(after, rules), 0.0)
+        return makespan(before) - cost
+    over = all_visited(after) | (after.decisions >= rules.max_decisions)
+    return _library(cost)[0].where(over, -cost, 0.0)
 
 
-def _rows(xp: Any, like: Array) -> Array:
-    return xp.arange(like.shape[0], device=device(like))
+# The two libraries. The array API has no quick way to read or write one entry of each row, and NumPy with one row (the
+# PettingZoo environment) is several times faster by a slice than by arrays of indices.
+
+_NUMPY = array_namespace(np.empty(0)), "cpu"
+
+
+def _library(array: Array) -> tuple[Any, Any]:
+    """The array's (namespace, device)."""
+    return _NUMPY if type(array) is np.ndarray else (array_namespace(array), device(array))
+
+
+@lru_cache(maxsize=64)
+def _range(xp: Any, size: int, on: Any) -> Array:
+    return xp.arange(size, device=on)  # shared by all callers: only to be read
+
+
+def _indices(array: Array, axis: int) -> Array:
+    """(array.shape[axis],) int64: 0, 1, 2, ... on the array's device."""
+    xp, on = _library(array)
+    return _range(xp, array.shape[axis], on)
+
+
+def _pick(array: Array, column: Array) -> Array:
+    """(B, ...) Row b's entry ``column[b]`` of an array (B, k, ...)."""
+    if type(array) is np.ndarray and len(array) == 1:
+        return array[:, column[0]]
+    return array[_indices(column, axis=0), column]
+
+
+def _pick_many(array: Array, columns: Array) -> Array:
+    """(B, m, ...) Row b's entries ``columns[b]``, with ``columns`` (B, m), of an array (B, k, ...)."""
+    if type(array) is np.ndarray and len(array) == 1:
+        return array.take(columns[0], axis=1)
+    return array[_indices(columns, axis=0)[:, None], columns]
+
+
+def _put(array: Array, column: Array, value: Array) -> Array:
+    """A copy of an array (B, k) in which row b's entry ``column[b]`` is ``value[b]``."""
+    if type(array) is np.ndarray and len(array) == 1:
+        array = array.copy()
+        array[:, column[0]] = value
+    else:
+        array = _library(array)[0].asarray(array, copy=True)
+        array[_indices(column, axis=0), column] = value
+    return array
+
+
+def _norm(vector: Array) -> Array:
+    """(...) Lengths of the vectors (..., 2)."""
+    x, y = vector[..., 0], vector[..., 1]
+    return _library(vector)[0].sqrt(x * x + y * y)
 
 
 # Tours are kept in `visits` as one number per city, so that a state has a fixed shape however long its tours are:
@@ -261,15 +298,14 @@ def _rows(xp: Any, like: Array) -> Array:
 
 
 def _visit_code(decision: Array, agent: Array, from_depot: Array, n_agents: int) -> Array:
-    xp = array_namespace(decision)
-    return (decision * n_agents + agent) * 2 + xp.astype(from_depot, xp.int64)
+    return (decision * n_agents + agent) * 2 + from_depot
 
 
 def tours(visits: np.ndarray, destination: np.ndarray, close: bool = True) -> Tours:
     """The tours of one game so far, from its rows of ``visits`` (n,) and ``destination`` (m,), as NumPy arrays.
 
-    ``close`` appends the return leg to a tour whose agent is still out; an agent that never left has [0, 0], or [0] where
-    tours stay open. Waiting at the depot does not repeat it.
+    ``close`` appends the return leg to a tour whose agent is still out; an agent that never left has [0, 0], or [0]
+    where tours stay open. Waiting at the depot does not repeat it.
     """
     n_agents = len(destination)
     found: Tours = [[0] for _ in range(n_agents)]
@@ -281,6 +317,6 @@ def tours(visits: np.ndarray, destination: np.ndarray, close: bool = True) -> To
             tour.append(0)
         tour.append(city)
     for tour, node in zip(found, destination.tolist(), strict=True):
-        if tour[-1] != 0 and (close or node == 0) or close and len(tour) == 1:
+        if (tour[-1] != 0 and (close or node == 0)) or (close and len(tour) == 1):
             tour.append(0)
     return found

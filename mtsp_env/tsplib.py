@@ -1,16 +1,154 @@
-"""TSPLIB files with coordinates, read through vrplib and brought to the unit square."""
+"""TSPLIB 95 files with coordinates, read through vrplib and brought to the unit square.
+
+Lengths are real numbers in the file's units. TSPLIB's own rules make every edge a whole number, so an optimum printed
+for TSPLIB differs from a length here by up to half a unit per edge (EUC_2D) or one unit (the others).
+"""
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from mtsp_env.instance import Instance, from_coordinates
+from mtsp_env.instance import Instance, check_count, from_coordinates
 
 EARTH_RADIUS = 6378.388  # km, TSPLIB 95's
+EDGE_WEIGHT_TYPES = ("EUC_2D", "CEIL_2D", "ATT", "GEO")
 
 
 def read_tsplib(path: str | os.PathLike, n_agents: int) -> Instance:
-    raise NotImplementedError
+    """Read a symmetric TSP of TSPLIB; its first node becomes the depot, ``scale`` keeps the file's units.
+
+    - EUC_2D, CEIL_2D: straight-line lengths, neither rounded nor rounded up.
+    - ATT: TSPLIB's pseudo-Euclidean length sqrt((dx^2 + dy^2) / 10), not rounded up.
+    - GEO: kilometres. Latitude and longitude are read as DDD.MM, degrees and minutes (not decimals), and projected by
+      ``project``: exact through the centroid of the nodes, elsewhere a little too long. Against TSPLIB's great-circle
+      formula, unrounded: at most 1.5 %, on average 0.11 %, over all pairs of cities of ``examples/europe.tsp``.
+
+    Args:
+        path: the file. Its node numbers are not used: row k of NODE_COORD_SECTION, from 0, is node k.
+        n_agents: m, at least 1. TSPLIB has no field for it.
+
+    Raises:
+        ImportError: vrplib is not installed.
+        OSError: no such file.
+        ValueError: not such a file; the message names it and says what is allowed. Or n_agents below 1.
+    """
+    check_count("n_agents", n_agents, minimum=1)
+    path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"{path}: a directory, not a TSPLIB file")
+    fields = _parse(path.read_bytes().decode("utf-8", errors="replace"), path)  # old files have Latin-1 comments
+    try:
+        kind = _check_fields(fields)
+        name = str(fields.get("name", "")).strip() or path.stem
+        return from_coordinates(_planar(kind, _coordinates(fields)), n_agents, name)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _parse(text: str, path: Path) -> dict[str, Any]:
+    """The file's specifications and sections, by vrplib: keys in lower case, node numbers cut off."""
+    try:
+        from vrplib.parse import parse_vrplib
+    except ImportError as error:
+        raise ImportError('reading TSPLIB files needs vrplib: pip install "mtsp-env[tsplib]"') from error
+    try:
+        return parse_vrplib(text, compute_edge_weights=False)
+    except Exception as error:  # vrplib meets junk with whatever its parsing runs into
+        raise ValueError(
+            f"{path}: not a TSPLIB file with EDGE_WEIGHT_TYPE {_listed()} and a NODE_COORD_SECTION "
+            f"({type(error).__name__}: {error})"
+        ) from error
+
+
+def _check_fields(fields: dict[str, Any]) -> str:
+    """The EDGE_WEIGHT_TYPE; ValueError where the file is no TSP, or asks for more than visiting its nodes."""
+    kind = fields.get("edge_weight_type")
+    if kind not in EDGE_WEIGHT_TYPES:
+        found = "no EDGE_WEIGHT_TYPE" if kind is None else f"EDGE_WEIGHT_TYPE {str(kind)[:40]!r}"
+        raise ValueError(f"{found}; allowed are {_listed()}")
+    if str(fields.get("type", "TSP")).split()[:1] != ["TSP"]:  # some files name a person behind it
+        raise ValueError(f"TYPE {str(fields['type'])[:40]!r}; allowed is TSP")
+    if "fixed_edges" in fields:
+        raise ValueError("FIXED_EDGES_SECTION is not supported: tours may use any edge")
+    if "depot" in fields and np.asarray(fields["depot"]).tolist() != [0]:
+        raise ValueError("DEPOT_SECTION must name node 1: the first node is the depot")
+    return kind
+
+
+def _coordinates(fields: dict[str, Any]) -> np.ndarray:
+    """The coordinates as they stand in the file, float64 (n, 2)."""
+    if "node_coord" not in fields:
+        raise ValueError("no NODE_COORD_SECTION: only instances with coordinates are supported")
+    try:
+        xy = np.array(fields["node_coord"], dtype=np.float64)
+    except (ValueError, TypeError, OverflowError):
+        xy = np.empty(0)
+    if xy.ndim != 2 or xy.shape[1] != 2:
+        raise ValueError("every row of NODE_COORD_SECTION must be a node number and two coordinates")
+    dimension = fields.get("dimension")
+    if dimension != len(xy):
+        raise ValueError(f"DIMENSION must be the number of nodes, {len(xy)}, got {dimension!r}")
+    if not np.isfinite(xy).all():
+        node = int(np.argwhere(~np.isfinite(xy))[0, 0])
+        raise ValueError(f"coordinates must be finite, got {xy[node].tolist()} in row {node + 1}")
+    return xy
+
+
+def _planar(kind: str, xy: np.ndarray) -> np.ndarray:
+    """Points (n, 2) whose straight-line distances are the file's, in the file's units."""
+    if kind == "ATT":
+        return xy / math.sqrt(10.0)
+    if kind == "GEO":
+        return project(degrees(xy))
+    return xy
+
+
+def degrees(ddd_mm: np.ndarray) -> np.ndarray:
+    """TSPLIB's DDD.MM (degrees and minutes) as decimal degrees.
+
+    TSPLIB 95's text rounds to find the degrees; its published optima, and this function, cut the fraction off. Minutes
+    above 59 count as what they are: ali535 has some.
+    """
+    whole = np.trunc(ddd_mm)
+    return whole + (ddd_mm - whole) / 0.6
+
+
+def project(latlon: np.ndarray) -> np.ndarray:
+    """Latitudes and longitudes in degrees (n, 2), projected to a plane: kilometres (n, 2), x east, y north.
+
+    Azimuthal equidistant about the centroid c of the nodes, on TSPLIB's sphere. For nodes within an angle r of c the
+    straight line in the plane is never shorter than the great circle and longer by at most the factor r / sin(r): 1.7 %
+    within 2000 km of c, 11 % within 5000 km, 57 % within 10,000 km.
+
+    Raises:
+        ValueError: latitudes beyond 90 degrees, longitudes beyond 360, or nodes so spread over the globe that they
+            have no centroid.
+    """
+    if np.abs(latlon[:, 0]).max() > 90 or np.abs(latlon[:, 1]).max() > 360:
+        raise ValueError("GEO coordinates must be a latitude in [-90, 90] and a longitude in [-360, 360], as DDD.MM")
+    latitude, longitude = np.radians(latlon).T
+    sphere = np.stack(
+        [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)], axis=1
+    )  # (n, 3)
+    centre = sphere.mean(axis=0)
+    if np.linalg.norm(centre) < 1e-6:
+        raise ValueError("the nodes lie all round the globe and have no centroid to project about")
+    centre /= np.linalg.norm(centre)
+
+    turn = math.atan2(centre[1], centre[0])
+    east = np.array([-math.sin(turn), math.cos(turn), 0.0])
+    north = np.cross(centre, east)
+    x, y, up = sphere @ east, sphere @ north, sphere @ centre
+    across = np.hypot(x, y)  # sine of the angle to the centre; with `up` precise at any angle
+    angle = np.arctan2(across, up)
+    stretch = np.divide(angle, across, out=np.ones_like(across), where=across > 0)
+    return EARTH_RADIUS * np.stack([x * stretch, y * stretch], axis=1)
+
+
+def _listed() -> str:
+    return ", ".join(EDGE_WEIGHT_TYPES)

@@ -14,6 +14,7 @@ from torchrl.record import CSVLogger, TensorboardLogger
 from tqdm import tqdm
 
 from dan_policy.actor import make_actor
+from dan_policy.episode import find_device
 from dan_policy.network import DAN
 from dan_policy.weights import load, save
 from train import checkpoint
@@ -35,7 +36,7 @@ class Trainer:
         torch.manual_seed(config.seed)
         self.rng = np.random.default_rng(config.seed)
         network = load(config.init) if config.init else DAN(config.network)
-        self.network = network.to(config.device).train()
+        self.network = network.to(find_device(config.device)).train()
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate)
         self.schedule = torch.optim.lr_scheduler.StepLR(self.optimiser, config.decay_every, config.decay)
         self.baseline = RolloutBaseline(self.network, config, self.rng)

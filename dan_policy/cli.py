@@ -1,0 +1,296 @@
+"""The command ``mtsp``: solve instances from files, generate instances. Imports torch only to solve."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import re
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+import numpy as np
+
+from mtsp_env.instance import DISTRIBUTIONS, Instance, read_instance, sample_nodes, write_instance, write_tours
+from mtsp_env.render import check_suffix, format_lengths, save_picture
+from mtsp_env.tours import lower_bound, tour_lengths
+from mtsp_env.tsplib import read_tsplib
+from mtsp_env.version import __version__
+
+if TYPE_CHECKING:
+    from dan_policy.solution import Solution
+
+DEFAULT_SAMPLES = 64  # the paper's DAN(s.64)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command and return 0. Bad input exits with 2 and one line on stderr; Ctrl-C gives 130, silently."""
+    parser = _parser()
+    try:
+        args = parser.parse_args(argv)
+        args.run(args)
+        sys.stdout.flush()
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:  # the reader of our output, such as `head`, has seen enough
+        return 1
+    except OSError as error:
+        parser.error(f"{error.filename}: {error.strerror}" if error.filename and error.strerror else str(error))
+    except (ValueError, ImportError) as error:
+        parser.error(str(error))
+    return 0
+
+
+# mtsp solve: everything that can be wrong with the input is found before the first instance is solved
+
+
+def _solve(args: argparse.Namespace) -> None:
+    if args.samples is not None and args.decode != "sample":
+        raise ValueError("--samples needs --decode sample")
+    instances = [_read(Path(file), args.agents) for file in args.files]
+    plots, outs = _outputs(args.plot, instances), _outputs(args.out, instances)
+    _check_outputs(args.files, plots, outs)
+    try:
+        from dan_policy import solve
+    except ImportError as error:
+        raise ImportError(f'solving needs torch and torchrl ({error}): pip install "mtsp-env[dan]"') from error
+
+    for instance, plot, out in zip(instances, plots, outs, strict=True):
+        solution = solve(
+            instance,
+            policy=args.policy,
+            decode=args.decode,
+            samples=args.samples or DEFAULT_SAMPLES,
+            seed=args.seed,
+            device=args.device,
+        )
+        record = _record(instance, solution)
+        if args.json:
+            print(json.dumps(record), flush=True)
+        else:
+            _print_table(record)
+        if out is not None:
+            with _writing(out, quiet=args.json):
+                write_tours(out, **record)
+        if plot is not None:
+            with _writing(plot, quiet=args.json):
+                save_picture(plot, instance, solution.tours)
+
+
+def _read(path: Path, n_agents: int | None) -> Instance:
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        return read_instance(path, n_agents)
+    if suffix != ".tsp":
+        raise ValueError(f"{path}: unknown suffix {path.suffix!r}; choose from ['.json', '.tsp']")
+    if n_agents is None:
+        raise ValueError(f"{path}: a TSPLIB file does not say how many agents there are; add --agents")
+    return read_tsplib(path, n_agents)
+
+
+def _outputs(path: str | None, instances: Sequence[Instance]) -> list[Path | None]:
+    """Where each instance's result goes: ``path``, with the instance's name in it where there are several."""
+    if path is None or len(instances) == 1:
+        return [Path(path) if path else None for _ in instances]
+    target, found = Path(path), []
+    for instance in instances:
+        name = re.sub(r"[^\w.+-]+", "_", instance.name) or "instance"
+        stem, number = f"{target.stem}-{name}", 2
+        while (output := target.with_name(stem + target.suffix)) in found:
+            stem, number = f"{target.stem}-{name}-{number}", number + 1
+        found.append(output)
+    return found
+
+
+def _check_outputs(files: Sequence[str], plots: Sequence[Path | None], outs: Sequence[Path | None]) -> None:
+    taken = {Path(file).resolve() for file in files}
+    for path in filter(None, [*plots, *outs]):
+        if not path.parent.is_dir():
+            raise ValueError(f"{path}: no such folder")
+        if path.resolve() in taken:
+            raise ValueError(f"{path}: would overwrite another file of this command")
+        taken.add(path.resolve())
+    for plot in filter(None, plots):
+        check_suffix(plot)
+
+
+def _record(instance: Instance, solution: Solution) -> dict:
+    """What there is to say about a solution, in the file's units; measured by the judge, not by the solver."""
+    lengths = tour_lengths(instance.nodes, solution.tours) * instance.scale
+    return {
+        "name": instance.name,
+        "n_nodes": instance.n_nodes,
+        "n_agents": instance.n_agents,
+        "method": solution.method,
+        "seconds": solution.seconds,
+        "makespan": float(lengths.max()),
+        "lower_bound": lower_bound(instance) * instance.scale,
+        "lengths": lengths.tolist(),
+        "tours": [[int(node) for node in tour] for tour in solution.tours],
+    }
+
+
+def _print_table(record: dict) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console(highlight=False)
+    *lengths, bound = format_lengths([*record["lengths"], record["lower_bound"]])
+    makespan, longest = record["makespan"], int(np.argmax(record["lengths"]))
+
+    table = Table(box=box.SIMPLE, title_justify="left", title_style="bold")
+    table.title = Text(f"{record['name'] or 'mTSP'}: {record['n_nodes'] - 1} cities, {record['n_agents']} agents")
+    for heading in ("agent", "cities", "length", "share"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("tour (0: the depot, the file's first node)", no_wrap=True)
+    width = console.width - 15 - sum(max(7, len(length)) for length in [max(lengths, key=len)] * 4)
+    for agent, tour in enumerate(record["tours"]):
+        share = f"{record['lengths'][agent] / makespan:.0%}" if makespan else ""
+        cities = str(sum(node != 0 for node in tour))
+        style = "bold" if agent == longest and makespan else None
+        table.add_row(str(agent), cities, lengths[agent], share, _elide(tour, width), style=style)
+    console.print(table)
+
+    console.print(Text(f"makespan {lengths[longest]}; {_compare(makespan, record['lower_bound'], bound)}"))
+    console.print(Text(f"{record['method']} in {record['seconds']:.3g} s"))
+
+
+def _compare(makespan: float, lower_bound: float, written: str) -> str:
+    gap = makespan / lower_bound - 1 if lower_bound else 0.0
+    return f"at most {gap:.1%} above the best possible (lower bound {written})" if gap > 1e-9 else "the best possible"
+
+
+def _elide(tour: Sequence[int], width: int) -> str:
+    """A tour in at most ``width`` characters where that is possible: its beginning, its end, dots between."""
+    whole = " ".join(map(str, tour))
+    if len(whole) <= width:
+        return whole
+    shown = min(len(tour) - 1, width // 2)
+    while True:
+        end = max(2, shown // 3)
+        begin = max(2, shown - end)
+        text = " ".join([*map(str, tour[:begin]), "...", *map(str, tour[-end:])])
+        if len(text) <= width or shown <= 4:
+            return text
+        shown -= 1
+
+
+# mtsp generate
+
+
+def _generate(args: argparse.Namespace) -> None:
+    path = Path(args.out)
+    if path.suffix.lower() != ".json":
+        raise ValueError(f"{path}: unknown suffix {path.suffix!r}; choose from ['.json']")
+    nodes = sample_nodes(args.distribution, np.random.default_rng(args.seed), 1, args.nodes)[0]
+    instance = Instance(nodes, args.agents, f"{args.distribution}-{args.nodes}-{args.seed}")
+    with _writing(path):
+        write_instance(path, instance)
+
+
+@contextmanager
+def _writing(path: Path, quiet: bool = False) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise ValueError(f"{path}: cannot write it ({error.strerror or error})") from error
+    if not quiet:
+        print(f"wrote {path}")
+
+
+# Arguments
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        """One line, where argparse would print the usage too."""
+        self.exit(2, f"mtsp: error: {' '.join(message.split())}\n")
+
+
+def _parser() -> argparse.ArgumentParser:
+    layout = argparse.RawDescriptionHelpFormatter
+    parser = _Parser(
+        prog="mtsp",
+        description="The MinMax multiple travelling salesman problem: one tour per agent from the depot and back,\n"
+        "together through all cities, the longest as short as can be.",
+        epilog="examples:\n"
+        "  mtsp solve examples/europe.tsp --agents 5 --plot tours.png\n"
+        "  mtsp generate --nodes 100 --agents 10 big.json && mtsp solve big.json --decode sample\n"
+        "More on a command: mtsp COMMAND --help",
+        formatter_class=layout,
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="version", version=f"mtsp {__version__}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+
+    solve = commands.add_parser(
+        "solve",
+        help="plan tours with a trained policy",
+        description="Plan tours with a trained policy and print them; lengths are in the file's units.",
+        epilog="examples:\n"
+        "  mtsp solve examples/europe.tsp --agents 5 --plot tours.png\n"
+        "  mtsp solve a.tsp b.tsp --agents 4 --out tours.json     (writes tours-a.json, tours-b.json)\n"
+        "  mtsp solve big.json --decode sample --samples 256 --device cuda --json",
+        formatter_class=layout,
+        allow_abbrev=False,
+    )
+    solve.set_defaults(run=_solve)
+    option = solve.add_argument
+    option("files", nargs="+", metavar="FILE", help="TSPLIB (.tsp) or what `mtsp generate` wrote (.json)")
+    option("--agents", type=_whole(1), metavar="M", help="number of agents; default: what a .json file says")
+    option("--policy", default="default", help="a shipped policy or a .safetensors file (default: %(default)s)")
+    option(
+        "--decode",
+        choices=("greedy", "sample"),
+        default="greedy",
+        help="likeliest actions once, or the best of --samples draws (default: %(default)s)",
+    )
+    option("--samples", type=_whole(1), metavar="K", help=f"with --decode sample (default: {DEFAULT_SAMPLES})")
+    option("--seed", type=_whole(0), default=0, metavar="S", help="of the samples (default: %(default)s)")
+    option("--device", default="cpu", help="cpu, cuda, cuda:1, ... (default: %(default)s)")
+    option("--plot", metavar="PATH", help="draw the tours: .png, .svg, .pdf, ...")
+    option("--out", metavar="PATH", help="write the tours as JSON")
+    option("--json", action="store_true", help="print one JSON object per file and nothing else")
+
+    generate = commands.add_parser(
+        "generate",
+        help="write a random instance",
+        description="Write a random instance in the unit square.",
+        epilog="example:\n  mtsp generate --nodes 100 --agents 10 --seed 0 --distribution clustered big.json",
+        formatter_class=layout,
+        allow_abbrev=False,
+    )
+    generate.set_defaults(run=_generate)
+    option = generate.add_argument
+    option("out", metavar="OUT.json", help="where to write it")
+    option("--nodes", type=_whole(2), required=True, metavar="N", help="number of nodes, the depot included")
+    option("--agents", type=_whole(1), required=True, metavar="M", help="number of agents")
+    option("--seed", type=_whole(0), default=0, metavar="S", help="same seed, same instance (default: %(default)s)")
+    option(
+        "--distribution",
+        choices=sorted(DISTRIBUTIONS),
+        default="uniform",
+        help="of the nodes: %(choices)s (default: %(default)s)",
+    )
+    return parser
+
+
+def _whole(minimum: int) -> Callable[[str], int]:
+    """A type for argparse: a whole number from ``minimum`` to 2^63 - 1."""
+
+    def parse(text: str) -> int:
+        value = int(text) if re.fullmatch(r"[+-]?\d{1,19}", text) else math.inf
+        if not minimum <= value < 2**63:
+            raise argparse.ArgumentTypeError(f"must be a whole number of at least {minimum}, got {text!r}")
+        return int(value)
+
+    return parse
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,268 @@
+"""Pictures of tours. Needs the extra ``render`` (matplotlib), which is imported where the first picture is drawn."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mtsp_env.instance import Instance
+from mtsp_env.tours import tour_lengths
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLOURS = (
+    # Okabe and Ito's colours, then the ones that stay farthest from them and each other under normal vision,
+    # deuteranopia and protanopia. Agents from 20 on repeat them with dashed lines.
+    *("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#0000ff", "#691e00", "#5a1e4b", "#2d1ea5"),
+    *("#5a78ff", "#69d278", "#ffa5b4", "#d22d4b", "#2d2d78", "#691e2d", "#3c4bf0", "#874b69", "#a53c0f", "#4b96f0"),
+)
+UNVISITED = "#8c8c8c"
+LEGEND_ROWS = 24  # with more agents only so many of the longest tours are listed
+
+
+def draw_tours(instance: Instance, tours: Sequence[Sequence[int]], ax: Axes | None = None) -> Axes:
+    """Draw tours, finished or so far, into ``ax`` or a new figure (``.figure`` of what is returned).
+
+    One colour per agent, the depot a black square, unvisited cities hollow. A tour that is still open has no return leg
+    and a ring where its agent is or heads for. The legend gives lengths in the instance's units; the longest is bold.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+        ValueError: not one tour per agent, a tour that does not begin at the depot, or a node that does not exist.
+    """
+    _check_drawable(instance, tours)
+    if ax is None:
+        ax = _new_figure(_fitting_size(instance)).subplots()
+    _Picture(ax, instance).update(tours)
+    return ax
+
+
+def save_picture(
+    path: str | os.PathLike, instance: Instance, tours: Sequence[Sequence[int]], title: str | None = None
+) -> None:
+    """Draw tours into a file of any type that matplotlib knows by its suffix: .png, .svg, .pdf, ...
+
+    A failure leaves an older file as it was.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+        OSError: the file cannot be written.
+        ValueError: an unknown suffix, or tours that ``draw_tours`` refuses.
+    """
+    path = Path(path)
+    suffix = check_suffix(path)
+    ax = draw_tours(instance, tours)
+    if title is not None:
+        ax.set_title(title, parse_math=False)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        ax.figure.savefig(temporary, format=suffix, dpi=150, bbox_inches="tight")
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def check_suffix(path: str | os.PathLike) -> str:
+    """The picture format that a path's suffix names; ValueError where matplotlib does not know it."""
+    try:
+        from matplotlib.backend_bases import FigureCanvasBase
+    except ImportError as error:
+        raise _missing() from error
+    known = sorted(set(FigureCanvasBase.get_supported_filetypes()) - {"pgf"})  # which would run TeX
+    suffix = Path(path).suffix.lower().removeprefix(".")
+    if suffix not in known:
+        raise ValueError(f"{os.fspath(path)}: unknown picture suffix {suffix!r}; choose from {known}")
+    return suffix
+
+
+def format_lengths(lengths: Sequence[float]) -> list[str]:
+    """Lengths for people to compare: as many decimals for all as give the longest four digits."""
+    longest = max(lengths, default=0.0)
+    decimals = min(max(3 - math.floor(math.log10(longest)), 0), 12) if longest > 0 else 0
+    return [f"{length:,.{decimals}f}" for length in lengths]
+
+
+class Viewer:
+    """Draws game after game into one figure: a window (``show``) or an array.
+
+    A window never blocks. Where matplotlib's backend has none (MPLBACKEND=Agg, no display) nothing is shown.
+    """
+
+    def __init__(self, show: bool):
+        self.show = show
+        self._figure: Figure | None = None
+        self._instance: Instance | None = None
+
+    def draw(self, instance: Instance, tours: Sequence[Sequence[int]]) -> np.ndarray | None:
+        """The picture of ``tours``, uint8 (600, 800, 3), or None where it goes to a window.
+
+        Raises:
+            ImportError: matplotlib is not installed.
+            ValueError: tours that ``draw_tours`` refuses.
+        """
+        _check_drawable(instance, tours)
+        if self._figure is None or self._was_closed_by_hand():
+            self._figure = _new_window() if self.show else _new_figure((8.0, 6.0))
+            self._instance = None
+        if self._instance is not instance:
+            self._figure.clear()
+            self._picture = _Picture(self._figure.add_axes((0.02, 0.02, 0.70, 0.90)), instance)
+            self._instance = instance
+        self._picture.update(tours)
+
+        canvas = self._figure.canvas
+        if self.show:
+            canvas.draw_idle()
+            canvas.flush_events()
+            return None
+        canvas.draw()
+        return np.array(np.asarray(canvas.buffer_rgba())[:, :, :3])  # a copy: the canvas draws into its own again
+
+    def close(self) -> None:
+        """Close the window, if there is one; drawing again opens a new one."""
+        if self._figure is not None and self.show:
+            from matplotlib import pyplot
+
+            pyplot.close(self._figure)
+        self._figure = self._instance = None
+
+    def _was_closed_by_hand(self) -> bool:
+        if not self.show:
+            return False
+        from matplotlib import pyplot
+
+        return not pyplot.fignum_exists(self._figure.number)
+
+
+class _Picture:
+    """The artists of one instance's picture, made once; ``update`` moves them, which is faster than drawing anew."""
+
+    def __init__(self, ax: Axes, instance: Instance):
+        self.ax, self.instance = ax, instance
+        nodes, n, m = instance.nodes, instance.n_nodes, instance.n_agents
+        self.thin, self.bold = (1.6, 3.4) if n < 300 else (1.0, 2.4)
+        self.colours = _colours(m)  # (m, 4)
+
+        styles = ["-" if agent < len(COLOURS) else "--" for agent in range(m)]
+        self.lines = [ax.plot([], [], style, color=c)[0] for style, c in zip(styles, self.colours, strict=True)]
+        size = float(np.clip(4000 / n, 10, 45))  # points^2
+        self.cities = ax.scatter(*nodes[1:].T, s=size, linewidths=0.9, zorder=3)
+        self.heads = ax.scatter([], [], s=4 * size + 40, facecolors="none", linewidths=2.0, zorder=4)
+        ax.plot(*nodes[0], "s", color="black", markeredgecolor="white", markersize=11, zorder=5)
+
+        rows = self.lines[:LEGEND_ROWS]
+        self.legend = ax.legend(
+            rows, [" "] * len(rows), loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=9
+        )
+        if m > len(rows):
+            self.legend.set_title(f"the {len(rows)} longest of {m} tours", prop={"size": 9})
+        margin = 0.03 * (np.ptp(nodes, axis=0).max() or 1.0)
+        ax.set_xlim(nodes[:, 0].min() - margin, nodes[:, 0].max() + margin)
+        ax.set_ylim(nodes[:, 1].min() - margin, nodes[:, 1].max() + margin)
+        ax.set(aspect="equal", xticks=[], yticks=[])  # hidden ticks would still cost time
+        ax.axis("off")
+
+    def update(self, tours: Sequence[Sequence[int]]) -> None:
+        nodes = self.instance.nodes
+        lengths = tour_lengths(nodes, tours) * self.instance.scale  # (m,)
+        longest = int(lengths.argmax()) if lengths.any() else None
+
+        owner = np.full(len(nodes), -1)  # which agent visits a node
+        for agent, (line, tour) in enumerate(zip(self.lines, tours, strict=True)):
+            line.set_data(*nodes[list(tour)].T)
+            line.set_linewidth(self.bold if agent == longest else self.thin)
+            owner[list(tour)] = agent
+        owner = owner[1:]
+        visited = owner[:, None] >= 0
+        self.cities.set_facecolors(np.where(visited, self.colours[owner], _rgba("white")))
+        self.cities.set_edgecolors(np.where(visited, _rgba("white"), _rgba(UNVISITED)))
+
+        open_tours = [agent for agent, tour in enumerate(tours) if tour[-1] != 0]
+        self.heads.set_offsets(nodes[[tours[agent][-1] for agent in open_tours]])
+        self.heads.set_edgecolors(self.colours[open_tours])
+
+        written = format_lengths(lengths)
+        self._write_legend(lengths, written, longest)
+        title = self._title(written[longest or 0], int(visited.sum()), bool(open_tours))
+        self.ax.set_title(title, parse_math=False)
+
+    def _write_legend(self, lengths: np.ndarray, written: list[str], longest: int | None) -> None:
+        listed = np.sort(np.argsort(-lengths, kind="stable")[:LEGEND_ROWS])
+        for agent, handle, text in zip(listed, self.legend.get_lines(), self.legend.get_texts(), strict=True):
+            handle.set(color=self.colours[agent], linestyle=self.lines[agent].get_linestyle())
+            handle.set_linewidth(self.bold if agent == longest else self.thin)
+            text.set_text(f"agent {agent}:  {written[agent]}{'  longest' if agent == longest else ''}")
+            text.set_fontweight("bold" if agent == longest else "normal")
+
+    def _title(self, longest: str, visited: int, any_open: bool) -> str:
+        name, cities = self.instance.name or "mTSP", self.instance.n_nodes - 1
+        if any_open or visited < cities:
+            return f"{name}: {visited} of {cities} cities, longest tour so far {longest}"
+        return f"{name}: {cities} cities, {self.instance.n_agents} agents, makespan {longest}"
+
+
+def _check_drawable(instance: Instance, tours: Sequence[Sequence[int]]) -> None:
+    if len(tours) != instance.n_agents:
+        raise ValueError(f"expected {instance.n_agents} tours, one per agent, got {len(tours)}")
+    for agent, tour in enumerate(tours):
+        if len(tour) == 0 or tour[0] != 0:
+            raise ValueError(f"tour {agent} must begin at the depot 0, got {list(tour)[:5]}")
+        outside = [node for node in tour if not 0 <= node < instance.n_nodes]
+        if outside:
+            raise ValueError(f"tour {agent} visits node {outside[0]}, outside 0..{instance.n_nodes - 1}")
+
+
+def _fitting_size(instance: Instance) -> tuple[float, float]:
+    """Inches (width, height) that leave little empty beside instances that are wide or high."""
+    width, height = np.ptp(instance.nodes, axis=0) + 0.06
+    return float(np.clip(7 * width / height, 3, 7)), float(np.clip(7 * height / width, 3, 7))
+
+
+def _colours(n_agents: int) -> np.ndarray:
+    """RGBA (m, 4)."""
+    from matplotlib.colors import to_rgba_array
+
+    return to_rgba_array([COLOURS[agent % len(COLOURS)] for agent in range(n_agents)])
+
+
+def _rgba(colour: str) -> tuple[float, ...]:
+    from matplotlib.colors import to_rgba
+
+    return to_rgba(colour)
+
+
+def _new_figure(size: tuple[float, float]) -> Figure:
+    """A figure that belongs to no window and no pyplot state."""
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise _missing() from error
+    figure = Figure(figsize=size, dpi=100)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _new_window() -> Figure:
+    try:
+        from matplotlib import pyplot
+        from matplotlib.backend_bases import NonGuiException
+    except ImportError as error:
+        raise _missing() from error
+    figure = pyplot.figure(figsize=(8.0, 6.0))
+    figure.canvas.manager.set_window_title("mTSP")
+    with contextlib.suppress(NonGuiException):  # Figure.show would warn where the backend has no windows
+        figure.canvas.manager.show()
+    return figure
+
+
+def _missing() -> ImportError:
+    return ImportError('pictures need matplotlib: pip install "mtsp-env[render]"')

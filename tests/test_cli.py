@@ -1,0 +1,377 @@
+"""The command ``mtsp``: what it prints and writes, every bad input one line and exit code 2, quick to start."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import dan_policy
+from dan_policy.cli import main
+from mtsp_env import (
+    Instance,
+    __version__,
+    check_tours,
+    lower_bound,
+    makespan,
+    read_instance,
+    read_tours,
+    read_tsplib,
+    uniform,
+    write_instance,
+)
+
+pytest.importorskip("rich", reason="needs the extra dan")
+pytest.importorskip("vrplib", reason="needs the extra tsplib")
+pytest.importorskip("matplotlib", reason="needs the extra render")
+
+EUROPE = Path(__file__).parent.parent / "examples" / "europe.tsp"
+
+
+class FakeSolve:
+    """Stands where ``dan_policy.solve`` does: deals the cities round, and remembers what it was asked."""
+
+    def __init__(self):
+        self.calls: list[dict] = []
+
+    def __call__(self, instance: Instance, **options) -> SimpleNamespace:
+        self.calls.append(options)
+        cities, m = list(range(1, instance.n_nodes)), instance.n_agents
+        tours = [[0, *cities[agent::m], 0] for agent in range(m)]
+        return SimpleNamespace(tours=tours, makespan=makespan(instance.nodes, tours), seconds=0.25, method="fake")
+
+
+@pytest.fixture
+def solver(monkeypatch) -> FakeSolve:
+    fake = FakeSolve()
+    monkeypatch.setitem(vars(dan_policy), "solve", fake)
+    return fake
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch, square: Instance) -> Path:
+    """The working directory, with the square in it in two formats."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
+    write_instance("square.json", square)
+    rows = "".join(f"{k} {10 * x} {10 * y}\n" for k, (x, y) in enumerate(square.nodes, 1))
+    Path("ten.tsp").write_text(f"NAME: ten\nDIMENSION: 7\nEDGE_WEIGHT_TYPE: EUC_2D\nNODE_COORD_SECTION\n{rows}EOF\n")
+    return tmp_path
+
+
+def refused(capsys, *argv: str) -> str:
+    """The one line on stderr of a command that is refused."""
+    with pytest.raises(SystemExit) as caught:
+        main(argv)
+    printed = capsys.readouterr()
+    assert caught.value.code == 2
+    assert printed.out == ""
+    assert printed.err.startswith("mtsp: error: ")
+    assert printed.err.count("\n") == 1
+    assert printed.err.endswith("\n")
+    return printed.err
+
+
+# mtsp solve
+
+
+def test_json_is_the_judges_verdict_in_the_units_of_the_file(folder, solver, capsys) -> None:
+    assert main(["solve", "ten.tsp", "--agents", "2", "--json"]) == 0
+    printed = capsys.readouterr()
+    found = json.loads(printed.out)
+    assert printed.err == ""
+    assert list(found) == [
+        *("name", "n_nodes", "n_agents", "method", "seconds", "makespan", "lower_bound", "lengths", "tours")
+    ]
+    assert (found["name"], found["n_nodes"], found["n_agents"], found["method"]) == ("ten", 7, 2, "fake")
+    assert found["seconds"] == 0.25
+    assert found["tours"] == [[0, 1, 3, 5, 0], [0, 2, 4, 6, 0]]
+    across, side, diagonal = 50**0.5, 5.0, 10 * 1.25**0.5  # half a diagonal; half a side; corner to far middle
+    by_hand = [across + side + diagonal + across, side + 10.0 + across + side]
+    assert found["lengths"] == pytest.approx(by_hand)
+    assert found["makespan"] == pytest.approx(max(by_hand))
+    assert found["lower_bound"] == pytest.approx(15.0)
+    assert solver.calls == [
+        {"policy": "default", "decode": "greedy", "samples": 64, "seed": 0, "device": "cpu"}
+    ]  # the defaults that --help names
+
+
+def test_options_reach_the_solver(folder, solver) -> None:
+    options = "--policy a.safetensors --decode sample --samples 7 --seed 5 --device cuda:1 --json"
+    assert main(["solve", "square.json", *options.split()]) == 0
+    assert solver.calls == [
+        {"policy": "a.safetensors", "decode": "sample", "samples": 7, "seed": 5, "device": "cuda:1"}
+    ]
+
+
+def test_agents_of_a_json_file_are_its_own_unless_given(folder, solver, capsys) -> None:
+    for argv, expected in ((["square.json"], 2), (["square.json", "--agents", "9"], 9)):
+        assert main(["solve", *argv, "--json"]) == 0
+        assert len(json.loads(capsys.readouterr().out)["tours"]) == expected
+
+
+def test_table_names_every_agent_and_what_the_longest_tour_is_worth(folder, solver, capsys) -> None:
+    assert main(["solve", "ten.tsp", "--agents", "2"]) == 0
+    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    assert "ten: 6 cities, 2 agents" in lines
+    assert "0 3 30.32 100% 0 1 3 5 0" in lines
+    assert "1 3 27.07 89% 0 2 4 6 0" in lines
+    assert "makespan 30.32; at most 102.1% above the best possible (lower bound 15.00)" in lines
+    assert "fake in 0.25 s" in lines
+
+
+def test_table_fits_the_terminal_and_shows_both_ends_of_long_tours(folder, solver, capsys) -> None:
+    assert main(["solve", str(EUROPE), "--agents", "1"]) == 0
+    out = capsys.readouterr().out
+    row = next(line.split() for line in out.splitlines() if line.startswith("      0"))
+    assert row[:2] == ["0", "51"]
+    dots = row.index("...")
+    assert row[4:7] == ["0", "1", "2"]
+    assert row[-3:] == ["50", "51", "0"]
+    assert dots - 4 >= len(row) - dots - 1 > 2
+    assert max(len(line) for line in out.splitlines()) <= 80
+
+
+def test_names_are_text_not_markup(folder, solver, capsys) -> None:
+    write_instance("odd.json", Instance([[0.0, 0.0], [1.0, 1.0]], 1, name="[red]a[/red] [b"))
+    assert main(["solve", "odd.json"]) == 0
+    assert "[red]a[/red] [b: 1 cities" in capsys.readouterr().out
+
+
+def test_all_nodes_in_one_place_and_idle_agents(folder, solver, capsys) -> None:
+    write_instance("spot.json", Instance([[0.5, 0.5]] * 3, 5))
+    assert main(["solve", "spot.json", "--plot", "spot.png"]) == 0
+    out = capsys.readouterr().out
+    assert "makespan 0; the best possible" in out
+    assert out.endswith("wrote spot.png\n")
+
+
+def test_files_hold_what_was_printed(folder, solver, capsys) -> None:
+    assert main(["solve", "ten.tsp", "--agents", "2", "--json", "--out", "tours.json", "--plot", "tours.svg"]) == 0
+    found = json.loads(capsys.readouterr().out)  # and nothing else
+    assert json.loads(Path("tours.json").read_text()) == found
+    assert read_tours("tours.json") == found["tours"]
+    assert Path("tours.svg").read_bytes().startswith(b"<?xml")
+
+
+def test_several_files_get_their_names_into_the_outputs(folder, solver, capsys) -> None:
+    Path("again.tsp").write_text(Path("ten.tsp").read_text())
+    write_instance("slash.json", Instance([[0.0, 0.0], [1.0, 1.0]], 1, name="../a b"))
+    write_instance("blank.json", Instance([[0.0, 0.0], [1.0, 1.0]], 1))
+    files = ["ten.tsp", "square.json", "again.tsp", "slash.json", "blank.json"]
+    inputs = set(folder.iterdir())
+    assert main(["solve", *files, "--agents", "2", "--json", "--out", "t.json", "--plot", "t.png"]) == 0
+    records = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [record["name"] for record in records] == ["ten", "square", "ten", "../a b", ""]
+    stems = ["t-ten", "t-square", "t-ten-2", "t-.._a_b", "t-instance"]
+    assert {path.name for path in set(folder.iterdir()) - inputs} == {
+        f"{s}{e}" for s in stems for e in (".json", ".png")
+    }
+    assert [json.loads(Path(f"{stem}.json").read_text()) for stem in stems] == records
+
+
+def test_it_says_where_the_files_are(folder, solver, capsys) -> None:
+    assert main(["solve", "square.json", "--out", "t.json", "--plot", "t.png"]) == 0
+    assert capsys.readouterr().out.splitlines()[-2:] == ["wrote t.json", "wrote t.png"]
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        ("nowhere.tsp --agents 2", "nowhere.tsp: No such file or directory"),
+        ("nowhere.json", "nowhere.json: No such file or directory"),
+        ("square.txt", "square.txt: unknown suffix '.txt'; choose from ['.json', '.tsp']"),
+        ("ten.tsp", "ten.tsp: a TSPLIB file does not say how many agents there are; add --agents"),
+        ("junk.tsp --agents 2", "junk.tsp: not a TSPLIB file"),
+        ("junk.json", "junk.json: not a JSON file"),
+        ("square.json nowhere.json", "nowhere.json: No such file"),
+        ("square.json --agents 0", "--agents: must be a whole number of at least 1, got '0'"),
+        ("square.json --agents two", "--agents: must be a whole number of at least 1, got 'two'"),
+        ("square.json --agents 2.5", "got '2.5'"),
+        ("square.json --decode sample --samples -3", "--samples: must be a whole number of at least 1, got '-3'"),
+        ("square.json --samples 3", "--samples needs --decode sample"),
+        ("square.json --seed -1", "--seed: must be a whole number of at least 0, got '-1'"),
+        ("square.json --seed 9223372036854775808", "--seed: must be"),
+        ("square.json --decode beam", "invalid choice: 'beam'"),
+        ("square.json --plot t.xyz", "t.xyz: unknown picture suffix 'xyz'"),
+        ("square.json --plot nowhere/t.png", "nowhere/t.png: no such folder"),
+        ("square.json --out nowhere/t.json", "nowhere/t.json: no such folder"),
+        ("square.json --out square.json", "square.json: would overwrite another file of this command"),
+        ("square.json --out t.svg --plot ./t.svg", "t.svg: would overwrite another file of this command"),
+        ("", "required: FILE"),
+        ("square.json --sample 3", "unrecognized arguments: --sample"),
+    ],
+)
+def test_bad_input_is_refused_before_anything_is_solved(folder, solver, capsys, argv: str, message: str) -> None:
+    Path("junk.tsp").write_bytes(b"\x00\xffjunk\n")
+    Path("junk.json").write_bytes(b"\x00\xffjunk\n")
+    before = sorted(folder.iterdir())
+    assert message in refused(capsys, "solve", *argv.split())
+    assert solver.calls == []
+    assert sorted(folder.iterdir()) == before
+
+
+@pytest.mark.parametrize("option", ["--plot", "--out"])
+def test_an_output_that_cannot_be_written(folder, solver, capsys, option: str) -> None:
+    Path("taken.png").mkdir()
+    with pytest.raises(SystemExit) as caught:
+        main(["solve", "square.json", "--json", option, "taken.png"])
+    printed = capsys.readouterr()
+    assert caught.value.code == 2
+    assert printed.err.startswith("mtsp: error: taken.png: cannot write it (")
+    assert printed.err.count("\n") == 1
+    assert json.loads(printed.out)["name"] == "square"  # what was solved is not lost
+    assert not [path for path in folder.iterdir() if path.suffix == ".tmp"]
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (FileNotFoundError("no weights at mine; shipped are ['default']"), "no weights at mine; shipped are"),
+        (ValueError("bad\nweights"), "bad weights"),
+        (ImportError("no torch"), "no torch"),
+    ],
+)
+def test_what_the_solver_refuses_is_one_line_too(folder, monkeypatch, capsys, error: Exception, message: str) -> None:
+    def solve(*_, **__):
+        raise error
+
+    monkeypatch.setitem(vars(dan_policy), "solve", solve)
+    assert message in refused(capsys, "solve", "square.json", "--policy", "mine")
+
+
+def test_an_interrupt_is_quiet(folder, monkeypatch, capsys) -> None:
+    def solve(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(vars(dan_policy), "solve", solve)
+    assert main(["solve", "square.json"]) == 130
+    assert capsys.readouterr() == ("", "")
+
+
+# mtsp generate
+
+
+@pytest.mark.parametrize("distribution", ["uniform", "clustered"])
+def test_generate_writes_the_same_instance_for_the_same_seed(folder, capsys, distribution: str) -> None:
+    for seed, path in ((4, "a.json"), (4, "b.json"), (5, "c.json")):
+        argv = f"generate --nodes 20 --agents 3 --seed {seed} --distribution {distribution} {path}"
+        assert main(argv.split()) == 0
+        assert capsys.readouterr() == (f"wrote {path}\n", "")
+    a, b, c = (read_instance(path) for path in ("a.json", "b.json", "c.json"))
+    assert a == b != c
+    assert (a.n_nodes, a.n_agents, a.name) == (20, 3, f"{distribution}-20-4")
+    assert not np.array_equal(a.nodes, c.nodes)
+
+
+def test_generate_defaults_are_the_papers(folder) -> None:
+    assert main(["generate", "--nodes", "20", "--agents", "3", "a.json"]) == 0
+    assert read_instance("a.json").nodes.tolist() == uniform(np.random.default_rng(0), 20, 3).nodes.tolist()
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        ("--nodes 1 --agents 2 a.json", "--nodes: must be a whole number of at least 2, got '1'"),
+        ("--nodes 5 --agents 0 a.json", "--agents: must be a whole number of at least 1, got '0'"),
+        ("--nodes 5 --agents 2 --seed -1 a.json", "--seed: must be a whole number of at least 0"),
+        ("--nodes 5 --agents 2 --distribution ring a.json", "invalid choice: 'ring'"),
+        ("--nodes 5 --agents 2 a.tsp", "a.tsp: unknown suffix '.tsp'; choose from ['.json']"),
+        ("--nodes 5 --agents 2 nowhere/a.json", "nowhere/a.json: cannot write it (No such file or directory)"),
+        ("--agents 2 a.json", "required: --nodes"),
+    ],
+)
+def test_generate_refuses(folder, capsys, argv: str, message: str) -> None:
+    assert message in refused(capsys, "generate", *argv.split())
+    assert not Path("a.json").exists()
+
+
+# The command itself
+
+
+def test_version_and_help(capsys) -> None:
+    for argv in (["--version"], ["--help"], ["solve", "--help"], ["generate", "--help"]):
+        with pytest.raises(SystemExit) as caught:
+            main(argv)
+        assert caught.value.code == 0
+        out = capsys.readouterr().out
+        assert out == f"mtsp {__version__}\n" if argv == ["--version"] else "example" in out
+
+
+def test_no_command_or_an_unknown_one(capsys) -> None:
+    assert "required: COMMAND" in refused(capsys)
+    assert "invalid choice: 'sovle'" in refused(capsys, "sovle")
+
+
+def run(*argv: str, **options) -> subprocess.CompletedProcess:
+    """``python -m dan_policy.cli`` as a process of its own."""
+    root = Path(__file__).parent.parent
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    command = [sys.executable, "-m", "dan_policy.cli", *argv]
+    return subprocess.run(command, env=environment, text=True, check=False, **options)
+
+
+def test_only_solving_imports_torch(tmp_path) -> None:
+    """An import of anything heavy would fail here, as these modules are made impossible to import."""
+    code = (
+        "import sys\n"
+        "for heavy in ('torch', 'tensordict', 'torchrl', 'matplotlib', 'numba', 'rich', 'vrplib'):\n"
+        "    sys.modules[heavy] = None\n"
+        "from dan_policy.cli import main\n"
+        "sys.exit(main(sys.argv[1:]))\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent)}
+    start = [sys.executable, "-c", code]
+    options = {"env": environment, "text": True, "capture_output": True, "check": False}
+    made = subprocess.run([*start, "generate", "--nodes", "5", "--agents", "2", str(tmp_path / "a.json")], **options)
+    assert (made.returncode, made.stderr) == (0, "")
+    solved = subprocess.run([*start, "solve", str(tmp_path / "a.json")], **options)
+    assert solved.returncode == 2
+    assert solved.stderr.startswith("mtsp: error: ")
+    assert solved.stderr.count("\n") == 1
+    assert 'pip install "mtsp-env[dan]"' in solved.stderr
+
+
+@pytest.mark.skipif(os.name == "nt", reason="pipes break differently there")
+def test_a_reader_that_has_seen_enough_is_no_error(tmp_path) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    argv = ("generate", "--nodes", "5", "--agents", "2", str(tmp_path / "a.json"))
+    done = run(*argv, stdout=writer, stderr=subprocess.PIPE)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (1, "")
+
+
+def test_solves_with_a_policy_from_a_file(folder, capsys) -> None:
+    """No fake here: an untrained network plans tours that the judge accepts."""
+    pytest.importorskip("torchrl", reason="needs the extra dan")
+    network = dan_policy.DAN(dan_policy.DANConfig(embed_dim=16, feedforward_dim=16, n_heads=2, city_layers=1))
+    dan_policy.save("mine.safetensors", network)
+    instance = read_tsplib(EUROPE, 3)
+    for options in ("", "--decode sample --samples 4 --seed 1"):
+        argv = ["solve", str(EUROPE), "--agents", "3", "--policy", "mine.safetensors", "--json", *options.split()]
+        assert main(argv) == 0
+        found = json.loads(capsys.readouterr().out)
+        check_tours(instance, found["tours"])
+        assert found["makespan"] == pytest.approx(makespan(instance.nodes, found["tours"]) * instance.scale)
+        assert found["lower_bound"] == lower_bound(instance) * instance.scale <= found["makespan"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--policy nowhere.safetensors", "nowhere.safetensors"),
+        ("--policy square.json", "square.json"),
+        ("--policy mine.safetensors --device nonsense", "nonsense"),
+        ("--policy mine.safetensors --device cuda:99", "cuda:99"),
+    ],
+)
+def test_the_real_solver_refuses_in_one_line(folder, capsys, options: str, message: str) -> None:
+    pytest.importorskip("torchrl", reason="needs the extra dan")
+    network = dan_policy.DAN(dan_policy.DANConfig(embed_dim=16, feedforward_dim=16, n_heads=2, city_layers=1))
+    dan_policy.save("mine.safetensors", network)
+    assert message in refused(capsys, "solve", "square.json", *options.split())

@@ -1,0 +1,125 @@
+"""Who may import whom: arrows point down only, and importing the environment stays light."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from fnmatch import fnmatch
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("mtsp_env", "dan_policy", "train", "benchmarks")  # each may import those before it
+FILES = sorted(file.relative_to(ROOT).as_posix() for package in PACKAGES for file in (ROOT / package).rglob("*.py"))
+
+# Within the packages: files, what they may not import at all, and what not where the file is imported.
+FORBIDDEN = {
+    "mtsp_env/instance.py": ["mtsp_env.*"],
+    "mtsp_env/tours.py": [
+        "mtsp_env.rules",
+        "mtsp_env.mtsp_v0",
+        "mtsp_env.batched",
+        "mtsp_env.reference",
+        "mtsp_env.render",
+    ],
+    "mtsp_env/rules.py": [
+        "mtsp_env.mtsp_v0",
+        "mtsp_env.batched",
+        "mtsp_env.reference",
+        "mtsp_env.render",
+        "gymnasium*",
+    ],
+    "mtsp_env/mtsp_v0.py": ["mtsp_env.batched", "mtsp_env.reference"],
+    "mtsp_env/batched.py": ["mtsp_env.mtsp_v0", "mtsp_env.reference", "mtsp_env.render"],
+    "mtsp_env/reference.py": ["mtsp_env.rules", "mtsp_env.mtsp_v0", "mtsp_env.batched", "mtsp_env.render"],
+    "mtsp_env/render.py": ["mtsp_env.mtsp_v0", "mtsp_env.batched", "mtsp_env.reference"],
+    "dan_policy/network.py": ["mtsp_env*"],
+    "dan_policy/actor.py": ["mtsp_env*", "dan_policy.network"],
+}
+NEEDS_AN_EXTRA = {"torch", "tensordict", "torchrl", "numba", "matplotlib", "vrplib"}
+LIGHT = ["__init__", "instance", "tours", "tsplib", "rules", "mtsp_v0", "version"]
+
+
+def imports(file: Path, package: str) -> list[tuple[str, bool]]:
+    """Every module that a file imports, with its full name, and whether the file's own import runs it."""
+    found: list[tuple[str, bool]] = []
+
+    def visit(node: ast.AST, at_import: bool) -> None:
+        if isinstance(node, ast.Import):
+            found.extend((alias.name, at_import) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            above = package.split(".")[: len(package.split(".")) + 1 - node.level] if node.level else []
+            module = ".".join([*above, *([node.module] if node.module else [])])
+            found.append((module, at_import))
+            found.extend((f"{module}.{alias.name}", at_import) for alias in node.names)
+        typing_only = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        inside = (
+            at_import and not typing_only and not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
+        )
+        for child in ast.iter_child_nodes(node):
+            visit(child, inside)
+
+    visit(ast.parse(file.read_text(encoding="utf-8")), True)
+    return found
+
+
+def imports_of(file: str) -> list[tuple[str, bool]]:
+    return imports(ROOT / file, file.rpartition("/")[0].replace("/", "."))
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_arrows_point_down(file: str) -> None:
+    above = PACKAGES[PACKAGES.index(file.partition("/")[0]) + 1 :]
+    wrong = [name for name, _ in imports_of(file) if name.partition(".")[0] in (*above, "tests", "examples")]
+    assert not wrong
+
+
+@pytest.mark.parametrize("file", FORBIDDEN)
+def test_files_keep_apart(file: str) -> None:
+    if not (ROOT / file).exists():
+        pytest.skip("not written yet")
+    names = {name for name, _ in imports_of(file)}
+    assert not {name for name in names for pattern in FORBIDDEN[file] if fnmatch(name, pattern)}
+
+
+@pytest.mark.parametrize("module", LIGHT)
+def test_light_modules_import_no_extra_at_import(module: str) -> None:
+    top_level = {name.partition(".")[0] for name, at_import in imports_of(f"mtsp_env/{module}.py") if at_import}
+    assert not top_level & NEEDS_AN_EXTRA
+
+
+def test_the_environment_imports_light() -> None:
+    """Nor does what it imports import anything heavy; importing does not touch the global random state either."""
+    code = f"""
+import sys, numpy
+numpy.random.seed(3)
+before = numpy.random.get_state()[1].tobytes()
+import mtsp_env, mtsp_env.mtsp_v0
+assert numpy.random.get_state()[1].tobytes() == before, "numpy's global random state has changed"
+heavy = sorted({NEEDS_AN_EXTRA!r} & set(sys.modules))
+assert not heavy, heavy
+"""
+    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+
+
+@pytest.mark.parametrize(
+    ("code", "found"),
+    [
+        ("import torch.nn as nn", [("torch.nn", True)]),
+        ("from mtsp_env import rules", [("mtsp_env", True), ("mtsp_env.rules", True)]),
+        ("from . import rules", [("mtsp_env", True), ("mtsp_env.rules", True)]),
+        ("from ..train.loss import f", [("train.loss", True), ("train.loss.f", True)]),
+        ("try:\n import torch\nexcept ImportError: pass", [("torch", True)]),
+        ("def f():\n import torch", [("torch", False)]),
+        ("if TYPE_CHECKING:\n import torch", [("torch", False)]),
+        ("class A:\n import torch", [("torch", True)]),
+    ],
+)
+def test_imports_are_found(tmp_path: Path, code: str, found: list[tuple[str, bool]]) -> None:
+    """Of the check itself: what it sees in a file of the package mtsp_env."""
+    file = tmp_path / "module.py"
+    file.write_text(code, encoding="utf-8")
+    assert imports(file, "mtsp_env") == found

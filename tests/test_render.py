@@ -1,0 +1,287 @@
+"""Pictures: what is drawn where, files, windows that are not there."""
+
+import itertools
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from mtsp_env import Instance, mtsp_v0, uniform
+from mtsp_env.render import COLOURS, Viewer, check_suffix, draw_tours, format_lengths, save_picture
+
+pytest.importorskip("matplotlib", reason="needs the extra render")
+from matplotlib import pyplot
+from matplotlib.colors import to_rgba, to_rgba_array
+
+pytestmark = pytest.mark.filterwarnings("error")
+
+
+def legend(ax) -> list[str]:
+    return [text.get_text() for text in ax.get_legend().get_texts()]
+
+
+def drawn_line(ax, agent: int) -> list[list[float]]:
+    return np.transpose(ax.get_lines()[agent].get_data()).tolist()
+
+
+# What is drawn
+
+
+def test_finished_tours(square: Instance, square_tours: list[list[int]]) -> None:
+    ax = draw_tours(square, square_tours)
+    for agent, tour in enumerate(square_tours):
+        assert drawn_line(ax, agent) == square.nodes[tour].tolist()
+        assert to_rgba(ax.get_lines()[agent].get_color()) == to_rgba(COLOURS[agent])
+    depot = ax.get_lines()[-1]
+    assert (depot.get_marker(), drawn_line(ax, -1)) == ("s", [[0.5, 0.5]])
+    cities, heads = ax.collections
+    assert cities.get_offsets().tolist() == square.nodes[1:].tolist()
+    assert cities.get_facecolors().tolist() == to_rgba_array([COLOURS[0]] * 3 + [COLOURS[1]] * 3).tolist()
+    assert len(heads.get_offsets()) == 0
+    assert legend(ax) == ["agent 0:  2.000  longest", "agent 1:  2.000"]
+    assert ax.get_title() == "square: 6 cities, 2 agents, makespan 2.000"
+    assert ax.get_aspect() == 1.0
+
+
+def test_tours_so_far(square: Instance) -> None:
+    """No return leg, a ring where the agent heads for, cities hollow that nobody has picked yet."""
+    ax = draw_tours(square, [[0, 2, 1], [0]])
+    assert drawn_line(ax, 0) == [[0.5, 0.5], [0.5, 1.0], [0.0, 1.0]]
+    assert drawn_line(ax, 1) == [[0.5, 0.5]]
+    cities, heads = ax.collections
+    assert heads.get_offsets().tolist() == [[0.0, 1.0]]
+    white, agent = to_rgba("white"), to_rgba(COLOURS[0])
+    assert [tuple(face) for face in cities.get_facecolors()] == [agent, agent, white, white, white, white]
+    assert not any(tuple(edge) == white for edge in cities.get_edgecolors()[2:])
+    assert ax.get_title() == "square: 2 of 6 cities, longest tour so far 1.000"
+
+
+def test_lengths_are_in_the_units_of_the_instance_and_the_longest_stands_out() -> None:
+    instance = Instance([[0.0, 0.0], [0.5, 0.0], [1.0, 0.0]], 3, "road", scale=2000.0)
+    ax = draw_tours(instance, [[0, 1, 0], [0, 2, 0], [0, 0]])
+    assert legend(ax) == ["agent 0:  2,000", "agent 1:  4,000  longest", "agent 2:  0"]
+    assert [text.get_fontweight() for text in ax.get_legend().get_texts()] == ["normal", "bold", "normal"]
+    widths = [line.get_linewidth() for line in ax.get_lines()[:3]]
+    assert widths[1] > widths[0] == widths[2]
+
+
+def test_with_many_agents_the_longest_tours_are_listed() -> None:
+    instance = Instance([[0.0, 0.0], *([k / 40, 0.0] for k in range(1, 41))], n_agents=40)
+    ax = draw_tours(instance, [[0, k, 0] for k in range(1, 41)])
+    assert ax.get_legend().get_title().get_text() == "the 24 longest of 40 tours"
+    assert [text.split(":")[0] for text in legend(ax)] == [f"agent {k}" for k in range(16, 40)]
+    for agent, handle in zip(range(16, 40), ax.get_legend().get_lines(), strict=True):
+        assert to_rgba(handle.get_color()) == to_rgba(COLOURS[agent % 20])
+        assert handle.get_linestyle() == ("-" if agent < 20 else "--")
+
+
+def test_twenty_colours_differ_for_the_colour_blind_too() -> None:
+    """CIE76 distances of at least 15 (2 is noticeable) under normal vision, and under full deuteranopia and protanopia
+    as simulated by Machado et al. 2009."""
+    deuteranopia = [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
+    protanopia = [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    srgb = to_rgba_array([*COLOURS, "white"])[:, :3]
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    for vision in (np.eye(3), deuteranopia, protanopia):
+        xyz = np.clip(linear @ np.transpose(vision), 0, 1) @ to_xyz.T / to_xyz.sum(axis=1)
+        f = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
+        lab = np.stack([116 * f[:, 1] - 16, 500 * (f[:, 0] - f[:, 1]), 200 * (f[:, 1] - f[:, 2])], axis=1)
+        assert min(np.linalg.norm(a - b) for a, b in itertools.combinations(lab, 2)) > 15
+    assert len(COLOURS) == 20
+
+
+@pytest.mark.parametrize(
+    ("lengths", "written"),
+    [
+        ([2.0, 0.9], ["2.000", "0.900"]),
+        ([5677.31, 999.6], ["5,677", "1,000"]),
+        ([120.04, 3.0], ["120.0", "3.0"]),
+        ([0.01234], ["0.01234"]),
+        ([0.0, 0.0], ["0", "0"]),
+        ([], []),
+    ],
+)
+def test_lengths_for_people(lengths: list[float], written: list[str]) -> None:
+    assert format_lengths(lengths) == written
+
+
+def test_a_name_is_text_not_mathematics(tmp_path) -> None:
+    instance = Instance([[0.0, 0.0], [1.0, 1.0]], 1, name=r"$\broken{$ _x")
+    save_picture(tmp_path / "a.svg", instance, [[0, 1, 0]])
+    save_picture(tmp_path / "a.svg", instance, [[0, 1, 0]], title=r"$\frac$")
+
+
+@pytest.mark.parametrize("nodes", [[[0.3, 0.3]] * 3, [[0.0, 0.5], [0.5, 0.5], [1.0, 0.5]]])
+def test_degenerate_instances_can_be_drawn(tmp_path, nodes: list) -> None:
+    save_picture(tmp_path / "a.png", Instance(nodes, 5), [[0, 1, 0], [0, 2, 0], [0, 0], [0, 0], [0]])
+
+
+@pytest.mark.parametrize(
+    ("tours", "message"),
+    [
+        ([[0, 1, 0]], "expected 2 tours, one per agent, got 1"),
+        ([[0, 1, 0], [2, 0]], r"tour 1 must begin at the depot 0, got \[2, 0\]"),
+        ([[0, 1, 0], []], r"tour 1 must begin at the depot 0, got \[\]"),
+        ([[0, 7, 0], [0]], r"tour 0 visits node 7, outside 0\.\.6"),
+        ([[0, -1, 0], [0]], r"tour 0 visits node -1, outside 0\.\.6"),
+    ],
+)
+def test_what_is_no_tour_is_refused(square: Instance, tours: list, message: str) -> None:
+    viewer = Viewer(show=False)
+    for draw in (draw_tours, viewer.draw):
+        with pytest.raises(ValueError, match=message):
+            draw(square, tours)
+
+
+# Files
+
+
+@pytest.mark.parametrize(
+    ("suffix", "magic"), [(".png", b"\x89PNG"), (".PNG", b"\x89PNG"), (".svg", b"<?xml"), (".pdf", b"%PDF")]
+)
+def test_the_suffix_decides_the_format(tmp_path, square, square_tours, suffix: str, magic: bytes) -> None:
+    path = tmp_path / f"a{suffix}"
+    save_picture(path, square, square_tours)
+    assert path.read_bytes().startswith(magic)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_title_is_mine_where_i_give_one(tmp_path, square, square_tours) -> None:
+    with pyplot.rc_context({"svg.fonttype": "none"}):
+        save_picture(tmp_path / "a.svg", square, square_tours, title="mine")
+    text = (tmp_path / "a.svg").read_text()
+    assert "mine" in text
+    assert "makespan" not in text
+
+
+@pytest.mark.parametrize("name", ["a.xyz", "a", "a.pgf", ".png"])
+def test_an_unknown_suffix_is_refused(tmp_path, square, square_tours, name: str) -> None:
+    with pytest.raises(ValueError, match=r"unknown picture suffix .*'png'"):
+        save_picture(tmp_path / name, square, square_tours)
+    assert list(tmp_path.iterdir()) == []
+    assert check_suffix("some/where/a.JPG") == "jpg"
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, square, square_tours, monkeypatch) -> None:
+    path = tmp_path / "a.png"
+    path.write_bytes(b"old")
+
+    def full(*_):
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(OSError, match="no space"):
+        save_picture(path, square, square_tours)
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+    with pytest.raises(OSError, match="nowhere"):
+        save_picture(tmp_path / "nowhere" / "a.png", square, square_tours)
+
+
+# The viewer
+
+
+def test_an_array_per_step_and_each_its_own(square: Instance, square_tours: list[list[int]]) -> None:
+    viewer = Viewer(show=False)
+    start = viewer.draw(square, [[0], [0]])
+    kept = start.copy()
+    end = viewer.draw(square, square_tours)
+    assert (start.shape, start.dtype) == ((600, 800, 3), np.uint8)
+    assert np.array_equal(start, kept)
+    assert not np.array_equal(start, end)
+    assert np.array_equal(viewer.draw(square, [[0], [0]]), start)  # nothing of the later picture stays behind
+    viewer.close()
+
+
+def test_a_reused_figure_shows_what_a_fresh_one_would(square: Instance, square_tours: list[list[int]]) -> None:
+    other = uniform(np.random.default_rng(0), n_nodes=30, n_agents=4)
+    tours = [[0, *part, 0] for part in np.array_split(np.arange(1, 30), 4)]
+    used = Viewer(show=False)
+    used.draw(other, tours)
+    used.draw(square, [[0, 2], [0, 5]])
+    for instance, drawn in ((square, square_tours), (other, tours), (square, [[0, 1], [0]])):
+        assert np.array_equal(used.draw(instance, drawn), Viewer(show=False).draw(instance, drawn))
+
+
+def test_every_agent_and_city_can_be_seen(square: Instance, square_tours: list[list[int]]) -> None:
+    pixels = {tuple(pixel) for pixel in Viewer(show=False).draw(square, square_tours).reshape(-1, 3).tolist()}
+    for colour in (*COLOURS[:2], "black", "white"):
+        assert tuple(round(255 * channel) for channel in to_rgba(colour)[:3]) in pixels
+    assert not {tuple(round(255 * channel) for channel in to_rgba(colour)[:3]) for colour in COLOURS[2:]} & pixels
+
+
+def test_a_window_never_blocks_and_leaves_nothing_behind(square, square_tours, monkeypatch) -> None:
+    monkeypatch.setenv("DISPLAY", ":99")  # where there might be one, matplotlib warns that Agg does not use it
+    viewer, other = Viewer(show=True), Viewer(show=True)
+    before = pyplot.get_fignums()
+    for tours in ([[0], [0]], [[0, 2], [0]], square_tours):
+        assert viewer.draw(square, tours) is None
+    other.draw(square, square_tours)
+    assert len(pyplot.get_fignums()) == len(before) + 2  # a window each, the same one for every picture
+    viewer.close()
+    viewer.close()
+    assert len(pyplot.get_fignums()) == len(before) + 1
+    pyplot.close("all")  # by hand, so to speak
+    other.draw(square, square_tours)
+    assert len(pyplot.get_fignums()) == 1
+    other.close()
+    assert pyplot.get_fignums() == []
+
+
+def test_without_a_viewer_pyplot_is_left_alone(tmp_path, square, square_tours) -> None:
+    before = pyplot.get_fignums()
+    draw_tours(square, square_tours)
+    save_picture(tmp_path / "a.png", square, square_tours)
+    Viewer(show=False).draw(square, square_tours)
+    assert pyplot.get_fignums() == before
+
+
+def test_draws_into_given_axes(square: Instance, square_tours: list[list[int]]) -> None:
+    axes = pyplot.figure().subplots(1, 2)
+    assert draw_tours(square, square_tours, axes[1]) is axes[1]
+    assert not axes[0].has_data()
+    pyplot.close("all")
+
+
+# The environment's pictures, and none at all
+
+
+@pytest.mark.parametrize("mode", ["rgb_array", "human"])
+def test_the_environment_renders_every_step(mode: str) -> None:
+    env = mtsp_v0.env(n_nodes=6, n_agents=2, render_mode=mode)
+    env.reset(seed=1)
+    pictures = []
+    for agent in env.agent_iter():
+        observation, _, termination, truncation, _ = env.last()
+        over = termination or truncation
+        env.step(None if over else env.action_space(agent).sample(observation["action_mask"]))
+        if not over:
+            pictures.append(env.render())
+    if mode == "human":
+        assert pictures == [None] * len(pictures)
+    else:
+        assert all(picture.shape == (600, 800, 3) for picture in pictures)
+        assert not np.array_equal(pictures[0], pictures[-1])
+    env.close()
+    assert pyplot.get_fignums() == []
+
+
+def test_matplotlib_is_imported_to_draw_only() -> None:
+    code = "import sys, mtsp_env.render; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_without_matplotlib_the_message_says_what_to_install(monkeypatch, tmp_path, square, square_tours) -> None:
+    for module in [name for name in sys.modules if name.split(".")[0] == "matplotlib"] + ["matplotlib"]:
+        monkeypatch.setitem(sys.modules, module, None)
+    for draw in (
+        lambda: save_picture(tmp_path / "a.png", square, square_tours),
+        lambda: draw_tours(square, square_tours),
+        lambda: Viewer(show=False).draw(square, square_tours),
+        lambda: Viewer(show=True).draw(square, square_tours),
+    ):
+        with pytest.raises(ImportError, match=r'pip install "mtsp-env\[render\]"'):
+            draw()
