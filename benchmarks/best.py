@@ -63,24 +63,26 @@ def merge(cell: Cell, seed: int, found: list[Tours], folder: Path = FOLDER) -> i
 
 
 def search(name: str, seed: int, seconds: float, folder: Path = FOLDER) -> None:
-    """Give every instance of a set ``seconds`` more of the reference solver, from its best known tours."""
-    from mtsp_env.reference import improve
-
+    """Give every instance ``seconds`` of the reference solver afresh, and as many from its best known tours."""
     for cell in cells(name):
-        instances = cell.instances(seed)
-        start = json.loads(path(cell, seed, folder).read_text()) if path(cell, seed, folder).exists() else []
-        start = start[: cell.count] + [None] * (cell.count - len(start))
-
-        def improved(i: int, instance: Instance, tours: Tours | None) -> Tours:
-            if tours is not None and makespan(instance.nodes, tours) <= lower_bound(instance) + CLOSED:
-                return tours
-            fresh = improve(instance, None, seconds=seconds, seed=seed + i)  # a fresh start leaves old optima
-            polished = fresh if tours is None else improve(instance, tours, seconds=seconds, seed=seed + i)
-            return min(fresh, polished, key=lambda found: makespan(instance.nodes, found))
-
-        jobs = track(list(zip(instances, start, strict=True)), description=f"{name} {cell.label}")
-        found = [improved(i, instance, tours) for i, (instance, tours) in enumerate(jobs)]
+        instances, file = cell.instances(seed), path(cell, seed, folder)
+        kept = json.loads(file.read_text())[: cell.count] if file.exists() else []
+        kept += [None] * (cell.count - len(kept))
+        jobs = track(list(zip(instances, kept, strict=True)), description=f"{name} {cell.label}")
+        found = [_improved(instance, tours, seconds, seed + i) for i, (instance, tours) in enumerate(jobs)]
         print(f"{cell.label}: {merge(cell, seed, found, folder)} of {cell.count} improved")
+
+
+def _improved(instance: Instance, tours: Tours | None, seconds: float, seed: int) -> Tours:
+    from mtsp_env.reference import improve  # numba: only where it is needed
+
+    if tours is not None and makespan(instance.nodes, tours) <= lower_bound(instance) + CLOSED:
+        return tours
+    found = improve(instance, seconds=seconds, seed=seed)
+    if tours is None:
+        return found
+    polished = improve(instance, tours, seconds=seconds, seed=seed)
+    return min(found, polished, key=lambda one: makespan(instance.nodes, one))
 
 
 def check(name: str, seed: int, folder: Path = FOLDER) -> str:
@@ -90,5 +92,7 @@ def check(name: str, seed: int, folder: Path = FOLDER) -> str:
         found = costs(cell, seed, folder)
         bounds = [lower_bound(instance) for instance in cell.instances(seed)]
         proved = sum(cost <= bound + CLOSED for cost, bound in zip(found, bounds, strict=True))
-        lines.append(f"{cell.label}: {len(found)} instances, mean {sum(found) / len(found):.4f}, {proved} at the lower bound")
+        lines.append(
+            f"{cell.label}: {len(found)} instances, mean {sum(found) / len(found):.4f}, {proved} at the lower bound"
+        )
     return "\n".join(lines)

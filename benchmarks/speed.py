@@ -135,8 +135,16 @@ def greedy_instances(network: DAN, device: str, seconds: float) -> tuple[float, 
 def trained_instances(device: str, precision: str, seconds: float) -> float:
     """Instances per second of whole training steps of the preset "quick": play, baseline, gradient, update."""
     trainer = Trainer(
-        replace(QUICK, device=device, precision=precision, n_nodes=(20, 20), n_agents=(3, 3), challenge_instances=8,
-                challenge_every=10**9, validate_every=10**9)  # fmt: skip
+        replace(
+            QUICK,
+            device=device,
+            precision=precision,
+            n_nodes=(20, 20),
+            n_agents=(3, 3),
+            challenge_instances=8,
+            challenge_every=10**9,
+            validate_every=10**9,
+        )
     )
 
     def step() -> int:

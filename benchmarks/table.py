@@ -14,7 +14,7 @@ from mtsp_env.tours import check_tours, makespan
 
 
 def gaps(name: str, methods: list[str], seed: int, seconds: float = 1.0) -> dict[str, dict[str, np.ndarray]]:
-    """method -> cell -> (count, 2): each instance's gap to its best known tours (0.1 is 10 %) and seconds of planning."""
+    """method -> cell -> (count, 2): each instance's gap to its best known tours (0.1 is 10 %), and seconds."""
     found: dict[str, dict[str, np.ndarray]] = {}
     with Progress() as progress:
         for method in methods:

@@ -13,11 +13,11 @@ OBSERVATION = ("cities", "agents", "visited")
 
 
 def make_actor(network: Callable[..., Tensor], in_keys: Sequence[str] = OBSERVATION) -> ProbabilisticActor:
-    """Turn ``network`` into a TorchRL actor that samples ``action`` from the softmax of its logits over ``action_mask``.
+    """A TorchRL actor that samples ``action`` from the softmax of the network's logits over ``action_mask``.
 
     Args:
         network: a module or a plain function; called with the tensors of ``in_keys`` (cities (..., n, 2), agents
-            (..., m, 3), visited (..., n)), returns logits (..., n). Masked nodes get probability 0 whatever their logit.
+            (..., m, 3), visited (..., n)), returns logits (..., n). Masked nodes get probability 0 in any case.
         in_keys: observation keys that it takes, in order; ``action_mask`` may be one of them.
 
     Returns:

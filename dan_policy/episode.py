@@ -20,8 +20,8 @@ class Episode:
     """One whole episode per row of a batch, and nothing after its end.
 
     Attributes:
-        decisions: TensorDict of shape [T, B]: the observation that each decision was made on, and ``action``; None where
-            they were not asked for. T is the longest episode's length.
+        decisions: TensorDict of shape [T, B]: the observation that each decision was made on, and ``action``; None
+            where they were not asked for. T is the longest episode's length.
         valid: (T, B) bool, False once a row's episode is over.
         reward: (B,) float32, each episode's undiscounted sum of rewards.
         last: TensorDict of shape [B], the last state of every row.
@@ -43,8 +43,8 @@ def rollout(
 ) -> Episode:
     """Play every row of ``env`` from a reset to its end.
 
-    ``env.rollout(break_when_all_done=True)`` would do the same with more overhead a step and rows that repeat themselves
-    after their end.
+    ``env.rollout(break_when_all_done=True)`` would do the same with more overhead a step and rows that repeat
+    themselves after their end.
 
     Args:
         actor: reads the observation and writes ``action``, as ``make_actor`` builds it.

@@ -131,7 +131,11 @@ class DAN(nn.Module):
             (..., n) float, in [-C, C]; a visited node's logit means nothing: the actor masks it.
         """
         lead, n = cities.shape[:-2], cities.shape[-2]
-        cities, agents, visited = cities.reshape(-1, n, 2), agents.reshape(-1, *agents.shape[-2:]), visited.reshape(-1, n)
+        cities, agents, visited = (
+            cities.reshape(-1, n, 2),
+            agents.reshape(-1, *agents.shape[-2:]),
+            visited.reshape(-1, n),
+        )
         if self.config.prune_visited:
             logits = self._pruned_logits(cities, agents, visited)
         else:

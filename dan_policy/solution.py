@@ -11,8 +11,8 @@ import torch
 from torch import nn
 
 from dan_policy.actor import make_actor
-from dan_policy.network import DAN
 from dan_policy.episode import Decode, find_device, rollout
+from dan_policy.network import DAN
 from dan_policy.weights import find, load
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.instance import Instance, Tours, check_count

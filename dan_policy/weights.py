@@ -18,7 +18,7 @@ SHIPPED = Path(__file__).parent / "weights"
 
 
 def save(path: str | os.PathLike, network: DAN, **extra: object) -> None:
-    """Write ``network`` to a ``.safetensors`` file; ``extra`` (JSON values, e.g. how it was trained) goes into its metadata.
+    """Write ``network`` to a ``.safetensors`` file; ``extra`` (JSON values: how it was trained) into its metadata.
 
     Written to a temporary name and moved, so that a crash leaves an older file whole.
     """

@@ -23,23 +23,24 @@ class BatchedMTSP(EnvBase):
 
     At each step row b's deciding agent, ``agent[b]``, picks its next node. Root keys:
 
-    - observation (of the deciding agent): ``cities`` (B, n, 2) float32, ``agents`` (B, m, 3) float32, ``visited`` (B, n)
-      bool, ``action_mask`` (B, n) bool, ``agent`` (B,) int64;
+    - observation (of the deciding agent): ``cities`` (B, n, 2) float32, ``agents`` (B, m, 3) float32, ``visited``
+      (B, n) bool, ``action_mask`` (B, n) bool, ``agent`` (B,) int64;
     - ``action`` (B,) int64, the node to go to next; ``reward`` (B, 1) float32; ``done``, ``terminated``, ``truncated``
       (B, 1) bool;
-    - the state: the fields of ``mtsp_env.rules.State``, ``nodes`` (B, n, 2) float64 first among them. The environment keeps
-      nothing else, so that any TensorDict of a rollout can be stepped from.
+    - the state: the fields of ``mtsp_env.rules.State``, ``nodes`` (B, n, 2) float64 first among them. The environment
+      keeps nothing else, so that any TensorDict of a rollout can be stepped from.
 
-    ``reset(TensorDict({"nodes": nodes}, batch_size=[B]), set_state=True)`` replays given instances; with all the fields of
-    the state in it, the games go on from there. With ``_reset`` in it, the rows asked for get fresh instances. A finished row that is stepped again repeats its last reward and ``done``.
+    ``reset(TensorDict({"nodes": nodes}, batch_size=[B]), set_state=True)`` replays given instances; with all the fields
+    of the state in it, the games go on from there. With ``_reset`` in it, the rows asked for get fresh instances. A
+    finished row that is stepped again repeats its last reward and ``done``.
 
     Args:
         n_nodes, n_agents, speed, depot, reward, max_decisions, distribution: as for ``mtsp_v0.raw_env``.
         batch_size: [B].
         device: where the games live, "cpu" or "cuda".
         seed: of the instances; a row's instance depends on the order of resets alone.
-        check_actions: raise ValueError on an illegal action. On a GPU this waits for the device at each step: switch it off
-            where the policy is masked.
+        check_actions: raise ValueError on an illegal action. On a GPU this waits for the device at each step: switch it
+            off where the policy is masked.
 
     Raises:
         ValueError: an argument outside its range, nodes outside the unit square, or an illegal action.
@@ -177,12 +178,16 @@ class BatchedMTSP(EnvBase):
 
     def _tensordict(self, state: rules.State, **extra: torch.Tensor) -> TensorDictBase:
         seen = rules.observe(state, self.rules)
-        return TensorDict({**seen._asdict(), **state._asdict(), **extra}, batch_size=self.batch_size, device=self.device)
+        return TensorDict(
+            {**seen._asdict(), **state._asdict(), **extra}, batch_size=self.batch_size, device=self.device
+        )
 
     def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
         """Write a uniformly random legal ``action``, read off ``action_mask``."""
         if tensordict is None or "action_mask" not in tensordict.keys():  # noqa: SIM118 (a TensorDict is no mapping)
-            raise ValueError("rand_action needs a TensorDict with the key 'action_mask', as reset() and step() return it")
+            raise ValueError(
+                "rand_action needs a TensorDict with the key 'action_mask', as reset() and step() return it"
+            )
         legal = tensordict.get("action_mask")
         rank = torch.rand(legal.shape[0], 1, device=legal.device) * legal.sum(1, keepdim=True)  # in [0, number legal)
         action = (legal.cumsum(1) <= rank).sum(1)

@@ -1,7 +1,7 @@
 """Instances of the MinMax mTSP: what they hold, where they come from, how they are stored.
 
-Coordinates lie in the unit square, as in the paper (Sec. 6: "uniformly at random in the unit square"); ``scale`` turns a
-length there into the units of the file that the instance was read from.
+Coordinates lie in the unit square, as in the paper (Sec. 6: "uniformly at random in the unit square"); ``scale`` turns
+a length there into the units of the file that the instance was read from.
 """
 
 from __future__ import annotations
@@ -59,9 +59,10 @@ class Instance:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Instance):
             return NotImplemented
-        return (
-            np.array_equal(self.nodes, other.nodes)
-            and (self.n_agents, self.name, self.scale) == (other.n_agents, other.name, other.scale)
+        return np.array_equal(self.nodes, other.nodes) and (self.n_agents, self.name, self.scale) == (
+            other.n_agents,
+            other.name,
+            other.scale,
         )
 
     def __reduce__(self) -> tuple:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
@@ -46,7 +46,12 @@ class raw_env(AECEnv, EzPickle):
         ValueError: an argument outside its range, an instance of another size, or an illegal action; nothing changes.
     """
 
-    metadata = {"name": "mtsp_v0", "render_modes": ["human", "rgb_array"], "is_parallelizable": False, "render_fps": 5}
+    metadata: ClassVar[dict[str, Any]] = {
+        "name": "mtsp_v0",
+        "render_modes": ["human", "rgb_array"],
+        "is_parallelizable": False,
+        "render_fps": 5,
+    }
 
     def __init__(
         self,
@@ -59,9 +64,7 @@ class raw_env(AECEnv, EzPickle):
         distribution: str = "uniform",
         render_mode: str | None = None,
     ):
-        EzPickle.__init__(
-            self, n_nodes, n_agents, speed, depot, reward, max_decisions, distribution, render_mode
-        )
+        EzPickle.__init__(self, n_nodes, n_agents, speed, depot, reward, max_decisions, distribution, render_mode)
         super().__init__()
         self.rules = rules.make_rules(n_nodes, n_agents, speed, depot, reward, max_decisions)
         check_distribution(distribution)
@@ -194,7 +197,7 @@ class raw_env(AECEnv, EzPickle):
         return int(self.game.ready[0].min())
 
     def state(self) -> np.ndarray:
-        """All there is, float32 (3 n + 4 m,): x, y, visited of each node; destination x, y, g, tour length of each agent."""
+        """All there is, float32 (3 n + 4 m,): nodes (x, y, visited), agents (destination x, y; g; tour length)."""
         game, m = self.game, self.n_agents
         seen = rules.observe(game, self.rules)
         per_node = np.concatenate([game.nodes[0], rules.visited(game)[0][:, None]], axis=1)
@@ -204,7 +207,7 @@ class raw_env(AECEnv, EzPickle):
         return np.concatenate([per_node.ravel(), per_agent.ravel()]).astype(np.float32)
 
     def render(self) -> np.ndarray | None:
-        """"rgb_array": the picture, uint8 (height, width, 3). "human": shown in a window, None."""
+        """ "rgb_array": the picture, uint8 (height, width, 3). "human": shown in a window, None."""
         if self.render_mode is None:
             raise ValueError(f"render() needs a render_mode; choose from {self.metadata['render_modes']} at creation")
         from mtsp_env.render import Viewer

@@ -9,7 +9,10 @@ from torchrl.envs.utils import check_env_specs, step_mdp
 from mtsp_env import Instance, check_tours, lower_bound, makespan, rules
 from mtsp_env.batched import BatchedMTSP
 
-DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device"))]
+DEVICES = [
+    "cpu",
+    pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")),
+]
 
 
 def make(batch=6, n_nodes=9, n_agents=3, **kwargs):

@@ -96,10 +96,14 @@ def test_the_glimpse_ignores_visited_cities_and_pruning_forgets_them():
     moved = torch.where(visited[:, :, None], cities + 0.3, cities)
     torch.manual_seed(0)
     pruned = DAN(CONFIGS["pruned"])
-    assert torch.allclose(open_logits(pruned, moved, agents, visited), open_logits(pruned, cities, agents, visited), atol=1e-5)
+    assert torch.allclose(
+        open_logits(pruned, moved, agents, visited), open_logits(pruned, cities, agents, visited), atol=1e-5
+    )
     whole = DAN(SMALL)
     whole.load_state_dict(pruned.state_dict())
-    assert not torch.allclose(open_logits(whole, moved, agents, visited), open_logits(whole, cities, agents, visited), atol=1e-4)
+    assert not torch.allclose(
+        open_logits(whole, moved, agents, visited), open_logits(whole, cities, agents, visited), atol=1e-4
+    )
     nothing = torch.zeros_like(visited)
     assert torch.allclose(pruned(cities, agents, nothing), whole(cities, agents, nothing), atol=1e-5)
 

@@ -76,7 +76,9 @@ def test_rollout_agrees_with_the_pettingzoo_environment(network):
         seen, _, terminated, truncated, info = env.last()
         if terminated or truncated:
             break
-        cities, agents, visited = (torch.as_tensor(seen["observation"][k])[None] for k in ("cities", "agents", "visited"))
+        cities, agents, visited = (
+            torch.as_tensor(seen["observation"][k])[None] for k in ("cities", "agents", "visited")
+        )
         logits = network(cities, agents, visited.bool())[0]
         env.step(int(logits.masked_fill(~torch.as_tensor(seen["action_mask"]).bool(), float("-inf")).argmax()))
     batched = BatchedMTSP(10, 3, [1])
@@ -85,7 +87,9 @@ def test_rollout_agrees_with_the_pettingzoo_environment(network):
 
 
 @settings(max_examples=30, deadline=None)
-@given(st.integers(2, 12), st.integers(1, 15), st.integers(0, 2**31), st.sampled_from(["greedy", "sample"]), st.booleans())
+@given(
+    st.integers(2, 12), st.integers(1, 15), st.integers(0, 2**31), st.sampled_from(["greedy", "sample"]), st.booleans()
+)
 def test_a_plan_always_solves_the_instance(n_nodes, n_agents, seed, decode, coincide):
     torch.manual_seed(seed)
     nodes = np.random.default_rng(seed).random((n_nodes, 2))

@@ -59,7 +59,9 @@ def test_the_gradient_is_reinforce_by_hand():
     config = replace(TINY, n_nodes=(4, 4))
     episode = play(network, Instances(nodes, 1), config, "sample", keep=True)
     episode.decisions["action"].copy_(torch.tensor([[1, 3], [2, 1], [3, 2]]))
-    masks = torch.tensor([[[0, 1, 1, 1], [0, 0, 1, 1], [0, 0, 0, 1]], [[0, 1, 1, 1], [0, 1, 1, 0], [0, 0, 1, 0]]]).bool()
+    masks = torch.tensor(
+        [[[0, 1, 1, 1], [0, 0, 1, 1], [0, 0, 0, 1]], [[0, 1, 1, 1], [0, 1, 1, 0], [0, 0, 1, 0]]]
+    ).bool()
     episode.decisions["action_mask"].copy_(masks.transpose(0, 1))
 
     advantage = torch.tensor([2.0, -1.0])

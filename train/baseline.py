@@ -67,4 +67,3 @@ def better(cost: Tensor, than: Tensor, p: float) -> bool:
     if np.ptp(difference) == 0:
         return True  # lower by the same amount everywhere: no doubt left, and the test would divide by 0
     return bool(ttest_rel(cost.cpu().numpy(), than.cpu().numpy(), alternative="less").pvalue < p)
-

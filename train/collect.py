@@ -40,7 +40,9 @@ def draw_set(rng: np.random.Generator, config: ReinforceConfig, count: int, size
     return [draw(rng, config, part) for part in counts]
 
 
-def play(network: nn.Module, instances: Instances, config: ReinforceConfig, decode: Decode, keep: bool = False) -> Episode:
+def play(
+    network: nn.Module, instances: Instances, config: ReinforceConfig, decode: Decode, keep: bool = False
+) -> Episode:
     """Whole, on-policy episodes of ``network``, one per instance; ``keep`` the decisions, to learn from them.
 
     The one place where training meets the environment: in one process, with ``rollout``.
@@ -48,7 +50,8 @@ def play(network: nn.Module, instances: Instances, config: ReinforceConfig, deco
     batch, n_nodes = instances.nodes.shape[:2]
     env = _environment(n_nodes, instances.n_agents, batch, config.speed, config.depot, config.device)
     with autocast(config):
-        return rollout(make_actor(network), env, decode, instances.nodes, (*OBSERVATION, "action_mask") if keep else ())
+        kept = (*OBSERVATION, "action_mask") if keep else ()
+        return rollout(make_actor(network), env, decode, instances.nodes, kept)
 
 
 def costs(network: nn.Module, instances: list[Instances], config: ReinforceConfig) -> Tensor:
@@ -63,7 +66,7 @@ def _environment(n_nodes: int, n_agents: int, batch: int, speed: float, depot: s
 
 @contextmanager
 def autocast(config: ReinforceConfig) -> Iterator[None]:
-    """The run's precision. On a CPU bfloat16 takes the plain attention kernel: the fused one is slow backwards there."""
+    """The run's precision. On a CPU bfloat16 takes the plain attention: the fused kernel is slow backwards there."""
     kind = torch.device(config.device).type
     lower = config.precision == "bfloat16"
     kernel = sdpa_kernel(SDPBackend.MATH) if lower and kind == "cpu" else nullcontext()

@@ -81,7 +81,15 @@ class ReinforceConfig:
             low, high = getattr(self, name)
             check_count(f"{name}[0]", low, minimum)
             check_count(f"{name}[1]", high, low)
-        for name in ("steps", "batch_size", "chunk", "decay_every", "challenge_every", "validate_every", "checkpoint_every"):
+        for name in (
+            "steps",
+            "batch_size",
+            "chunk",
+            "decay_every",
+            "challenge_every",
+            "validate_every",
+            "checkpoint_every",
+        ):
             check_count(name, getattr(self, name), 1)
         for name in ("challenge_instances", "validation_instances"):
             check_count(name, getattr(self, name), 2)

@@ -19,7 +19,8 @@ class EpisodicReinforceLoss(LossModule):
     """-(R - b) * log-probability, summed over decisions and averaged over episodes (paper, Sec. 5.1).
 
     The keys are those of TorchRL's ``ReinforceLoss`` (reads ``action``, ``advantage`` and what the actor reads, writes
-    ``loss_actor``); that one averages over decisions and wants a critic. Losses of parts of a batch add up to the whole's.
+    ``loss_actor``); that one averages over decisions and wants a critic. Losses of parts of a batch add up to the
+    whole's.
 
     Args:
         actor_network: as ``make_actor`` builds it.
@@ -52,7 +53,9 @@ class EpisodicReinforceLoss(LossModule):
         return TensorDict({"loss_actor": -(advantage.detach() * log_prob).sum() / self.n_episodes})
 
 
-def log_probs(actor: ProbabilisticTensorDictSequential, decisions: TensorDictBase, action: NestedKey = "action") -> Tensor:
+def log_probs(
+    actor: ProbabilisticTensorDictSequential, decisions: TensorDictBase, action: NestedKey = "action"
+) -> Tensor:
     """(N,) Log-probability of each decision's action under ``actor``, with gradients."""
     return actor.get_dist(decisions).log_prob(decisions.get(action))
 
@@ -60,8 +63,8 @@ def log_probs(actor: ProbabilisticTensorDictSequential, decisions: TensorDictBas
 def decisions_with_advantage(episode: Episode, advantage: Tensor) -> TensorDictBase:
     """All real decisions of a batch of episodes in one row, in order of time, each with its episode's advantage (B,).
 
-    Padding after an episode's end is left out. Relative coordinates change at every decision, so each is a sample of its
-    own; those of one time are neighbours, which keeps ``prune_visited`` efficient.
+    Padding after an episode's end is left out. Relative coordinates change at every decision, so each is a sample of
+    its own; those of one time are neighbours, which keeps ``prune_visited`` efficient.
     """
     decisions = episode.decisions.set("advantage", advantage.expand_as(episode.valid))
     return decisions[episode.valid]

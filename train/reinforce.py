@@ -69,7 +69,10 @@ class Trainer:
             logs["validation_cost"] = self.validate()
         seconds = time.perf_counter() - start
         self.seconds += seconds
-        return logs | {"instances_per_second": config.batch_size / seconds, "learning_rate": self.schedule.get_last_lr()[0]}
+        return logs | {
+            "instances_per_second": config.batch_size / seconds,
+            "learning_rate": self.schedule.get_last_lr()[0],
+        }
 
     def validate(self) -> float:
         """Mean greedy cost on the held-out instances; the best policy by it is kept in ``best.safetensors``."""
@@ -82,7 +85,9 @@ class Trainer:
     def save_weights(self, name: str) -> None:
         """The network alone, ready for ``dan_policy.solve``."""
         self.config.out.mkdir(parents=True, exist_ok=True)
-        save(self.config.out / name, self.network, step=self.step, instances=self.instances, config=self.config.to_dict())
+        save(
+            self.config.out / name, self.network, step=self.step, instances=self.instances, config=self.config.to_dict()
+        )
 
     def save(self) -> None:
         """Everything that a continuation needs, and the weights of now."""
