@@ -226,4 +226,5 @@ def check_moment(seen: Moment, truth: Moment, where: str) -> None:
     assert np.array_equal(seen.action_mask, truth.action_mask), where
     assert np.array_equal(seen.visited, truth.visited), where
     assert seen.cities.shape == truth.cities.shape and np.abs(seen.cities - truth.cities).max() <= 1e-6, where
+    assert not np.any(seen.agents[seen.agent]), where  # its own row: exactly zero
     assert seen.agents.shape == truth.agents.shape and np.abs(seen.agents - truth.agents).max() <= 1e-6, where

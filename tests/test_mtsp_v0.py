@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 import warnings
+from itertools import combinations
 
 import numpy as np
 import pettingzoo
@@ -119,15 +120,15 @@ def test_pettingzoo_makes_it() -> None:
 
 @on_grid
 def test_a_seed_fixes_all_episodes_after_it(settings: dict) -> None:
-    env = mtsp_v0.env(**settings)
-    stories = []
+    env, stories = mtsp_v0.env(**settings), []
     for _ in range(2):
-        env.reset(seed=7)
-        first = play(env)
-        env.reset()
-        stories.append((first, play(env)))
+        episodes = []
+        for seed in (7, None, None):
+            env.reset(seed=seed)
+            episodes.append(play(env))
+        stories.append(episodes)
+        assert not any(same(*pair) for pair in combinations(episodes, 2))  # each has an instance of its own
     assert same(*stories)
-    assert not same(*stories[0])  # the second episode has another instance
 
 
 @on_grid
@@ -249,6 +250,22 @@ def test_an_illegal_action_changes_nothing() -> None:
         assert env.agent_selection == agent and env.game is game and same(env.observe(agent), seen)
         assert env.rewards == rewards and env.tours == tours
         env.step(random_action(env, rng))
+
+
+def test_actions_are_checked_unobserved_too() -> None:
+    env = mtsp_v0.raw_env(n_nodes=5, n_agents=1)
+    for _ in range(2):
+        env.reset(seed=0)
+        env.step(1)
+        with pytest.raises(ValueError, match="node 1: it is visited already"):
+            env.step(1)
+        env.step(2)
+        with pytest.raises(ValueError, match="node 2: it is visited already"):
+            env.step(2)
+        env.observe("agent_0")
+        env.step(3)
+        with pytest.raises(ValueError, match="node 3: it is visited already"):
+            env.step(3)
 
 
 @pytest.mark.parametrize("kind", [int, np.int64, np.int32, np.array, torch.tensor], ids=lambda kind: kind.__name__)

@@ -1,0 +1,230 @@
+"""Near-optimal tours in milliseconds to seconds, to measure regret against and to learn from (extra ``reference``).
+
+>>> tours = improve(uniform(np.random.default_rng(0), n_nodes=50, n_agents=5), seconds=0.005)
+
+A ruin-and-recreate local search (``mtsp_env._sisr``) from greedy insertion or from given tours. Numba compiles its
+kernels when they are first needed, once per machine, and keeps them on disk (``__pycache__``, or ``NUMBA_CACHE_DIR``).
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import os
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+try:
+    from mtsp_env import _sisr
+except ModuleNotFoundError as error:
+    if error.name != "numba":
+        raise
+    raise ModuleNotFoundError(
+        "mtsp_env.reference needs Numba: pip install 'mtsp-env[reference]'", name="numba"
+    ) from error
+
+from mtsp_env.instance import Instance, Tours, check_count, check_nodes
+from mtsp_env.tours import check_tours, makespan
+
+ITERATIONS_PER_NODE = 500  # where neither seconds nor iterations are given
+HOT, COLD = 0.1, 0.0025  # first and last temperature, in units of makespan * sqrt(m / n), a few mean legs
+TURN_SECONDS = 5e-4  # at least, between looks at the clock, so that the calls cost little
+CLOSED = 1e-9  # a makespan this near the lower bound is optimal
+
+
+def improve(
+    instance: Instance,
+    tours: Sequence[Sequence[int]] | None = None,
+    seconds: float | None = None,
+    iterations: int | None = None,
+    seed: int = 0,
+) -> Tours:
+    """Near-optimal tours for ``instance``, never worse than the given ``tours``.
+
+    The search cools down over ``seconds`` or ``iterations``, whichever is over first (neither: 500 iterations for each
+    node), and ends early where the makespan is the farthest out-and-back trip, which none can beat.
+
+    Args:
+        instance: the problem.
+        tours: where to start; where they are worse than greedy insertion, or None, it starts from that.
+        seconds: of wall time, above 0. Preparation is O(n^2), and is not cut short: 0.02 s at n = 1000.
+            Compiling or loading the kernels, once per process, does not count.
+        iterations: at least 0, of 2 to 4 microseconds each; the result then depends on nothing but the arguments.
+        seed: a whole number of at least 0.
+
+    Returns:
+        One tour per agent, [0, ..., 0]; ``tours`` themselves, copied, where nothing better was found.
+
+    Raises:
+        ValueError: tours that do not solve the instance, or a number outside its range.
+    """
+    if seconds is not None and not (math.isfinite(seconds) and seconds > 0):
+        raise ValueError(f"seconds must be a finite number above 0, got {seconds!r}")
+    _check_search(iterations, seed)
+    if tours is not None:
+        check_tours(instance, tours)
+        tours = [[int(node) for node in tour] for tour in tours]
+    _compile()
+    found = _solve(instance.nodes, instance.n_agents, tours, seconds, iterations, seed)
+    if tours is not None and makespan(instance.nodes, tours) <= makespan(instance.nodes, found):
+        return tours
+    return found
+
+
+def improve_batch(
+    nodes: np.ndarray, n_agents: int, iterations: int | None = None, seed: int = 0, threads: int | None = None
+) -> list[Tours]:
+    """Near-optimal tours for each row of ``nodes`` (B, n, 2), the rows spread over ``threads``.
+
+    Row b is ``improve(Instance(nodes[b], n_agents), iterations=iterations, seed=seed)``, whatever the other rows and
+    the number of threads (None: one for each core that this process may use).
+
+    Raises:
+        ValueError: nodes that are not B instances, or a number outside its range.
+    """
+    nodes = np.asarray(nodes, dtype=np.float64)
+    if nodes.ndim != 3:
+        raise ValueError(f"nodes must have shape (B, n, 2), got {nodes.shape}")
+    if len(nodes):
+        check_nodes(nodes)
+    check_count("n_agents", n_agents, minimum=1)
+    _check_search(iterations, seed)
+    threads = _usable_cores() if threads is None else threads
+    check_count("threads", threads, minimum=1)
+    _compile()
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(lambda row: _solve(row, n_agents, None, None, iterations, seed), nodes))
+
+
+def _check_search(iterations: int | None, seed: int) -> None:
+    if iterations is not None:
+        check_count("iterations", iterations, minimum=0)
+    check_count("seed", seed, minimum=0)
+
+
+def _usable_cores() -> int:
+    if hasattr(os, "sched_getaffinity"):  # Linux: what a container or a batch system leaves us
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@functools.cache
+def _compile() -> None:
+    """Have every kernel compiled, or loaded from disk, before a clock runs."""
+    _solve(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), 1, [[0, 1, 2, 0]], None, 1, 0)
+
+
+def _solve(
+    nodes: np.ndarray, n_agents: int, tours: Tours | None, seconds: float | None, iterations: int | None, seed: int
+) -> Tours:
+    """``improve`` without its checks."""
+    started = time.perf_counter()
+    n = len(nodes)
+    if seconds is None and iterations is None:
+        iterations = ITERATIONS_PER_NODE * n
+    home = np.hypot(*(nodes - nodes[0]).T)  # (n,)
+    enough = 2.0 * float(home.max()) + CLOSED  # lower_bound's other part, the spanning tree, is never attained
+
+    # More agents than cities are of no use
+    search = _new_search(nodes, min(n_agents, n - 1), seed)
+    _sisr.insert_greedily(search, 1 + np.argsort(-home[1:], kind="stable"))
+    greedy = best = _sisr.sum_lengths(search)
+    if tours is not None and makespan(nodes, tours) < greedy:
+        _sisr.load_tours(search, *_cities_and_agents(tours))
+        best = _sisr.sum_lengths(search)
+
+    _anneal(search, best, enough, greedy * math.sqrt(len(search.length) / n), seconds, iterations, started)
+    return _as_tours(_sisr.best_order(search), n_agents)
+
+
+def _anneal(
+    search: _sisr.Search,
+    best: float,
+    enough: float,
+    unit: float,
+    seconds: float | None,
+    iterations: int | None,
+    started: float,
+) -> None:
+    """Cool down from HOT to COLD ``unit``s of length, until ``seconds`` after ``started`` or over ``iterations``."""
+    if best <= enough:
+        return
+    if seconds is None:
+        _sisr.anneal(search, iterations, HOT * unit, COLD * unit, best, enough)
+        return
+    limit = math.inf if iterations is None else iterations
+
+    def temperature(now: float, done: int) -> float:
+        progress = max((now - started) / seconds, done / limit)
+        return HOT * unit * (COLD / HOT) ** min(progress, 1.0)
+
+    # A kernel does not see the clock, so it is called in turns
+    turn_seconds = max(seconds / 100, TURN_SECONDS)
+    per_iteration, done, now = 1e-5, 0, time.perf_counter()
+    while best > enough and done < limit and now < started + seconds:
+        turn = int(min(max(min(turn_seconds, started + seconds - now) / per_iteration, 1), limit - done))
+        hot, cold = temperature(now, done), temperature(now + turn * per_iteration, done + turn)
+        best = _sisr.anneal(search, turn, hot, cold, best, enough)
+        before, now = now, time.perf_counter()
+        per_iteration = (now - before) / turn
+        done += turn
+
+
+def _new_search(nodes: np.ndarray, n_agents: int, seed: int) -> _sisr.Search:
+    """A search over ``nodes`` (n, 2) whose tours are empty."""
+    n, size = len(nodes), len(nodes) + n_agents
+    xy = np.concatenate([nodes, np.repeat(nodes[:1], n_agents, axis=0)])  # (N, 2)
+    x, y = np.ascontiguousarray(xy[:, 0]), np.ascontiguousarray(xy[:, 1])
+    near, near_distance = _sisr.nearest_cities(x, y, n, min(_sisr.N_NEAR, n - 2))
+    itself = np.arange(size, dtype=np.int32)  # an empty tour: the depot before and after itself
+    return _sisr.Search(
+        x=x,
+        y=y,
+        near=near,
+        near_distance=near_distance,
+        previous=itself,
+        next=itself.copy(),
+        leg=np.zeros(size),
+        tour=np.maximum(itself - n, -1),
+        length=np.zeros(n_agents),
+        count=np.zeros(n_agents, np.int32),
+        ruined=np.zeros(n_agents, np.int64),
+        best=itself.copy(),
+        random=np.array([_spread(seed)], np.uint64),
+        city_log=np.zeros((2, n), np.int32),
+        place_log=np.zeros(n, np.int32),
+        tour_log=np.zeros((2, n), np.int32),
+        length_log=np.zeros((2, n)),
+        key=np.zeros(n),
+    )
+
+
+def _spread(seed: int) -> int:
+    """Neighbouring seeds, spread over 64 bits (splitmix64); never 0."""
+    z = (seed + 0x9E3779B97F4A7C15) % 2**64
+    z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9 % 2**64
+    z = (z ^ (z >> 27)) * 0x94D049BB133111EB % 2**64
+    return (z ^ (z >> 31)) | 1
+
+
+def _cities_and_agents(tours: Tours) -> tuple[np.ndarray, np.ndarray]:
+    """The cities, tour by tour, and the number of each one's tour among those with cities; int64 (n - 1,) each.
+
+    Passing the depot in between only makes a tour longer, so it is left out.
+    """
+    cities = [[node for node in tour if node != 0] for tour in tours]
+    cities = [tour for tour in cities if tour]
+    return np.concatenate(cities), np.repeat(np.arange(len(cities)), [len(tour) for tour in cities])
+
+
+def _as_tours(order: np.ndarray, n_agents: int) -> Tours:
+    """Tours from ``_sisr.best_order``; agents that it leaves out stay at home."""
+    tours: Tours = [[0]]
+    for node in order.tolist():
+        tours[-1].append(node)
+        if node == 0:
+            tours.append([0])
+    return tours[:-1] + [[0, 0] for _ in range(n_agents - len(tours) + 1)]
