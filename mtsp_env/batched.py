@@ -83,8 +83,12 @@ class BatchedMTSP(EnvBase):
 
         state = {
             "nodes": Bounded(0.0, 1.0, (batch, n, 2), dtype=torch.float64, device=self.device),
+            "visited": Binary(n, (batch, n), dtype=torch.bool, device=self.device),
+            "cities_left": unbounded(),
+            "trips": unbounded(dtype=torch.float64),
             "visits": unbounded(n),
             "destination": unbounded(m),
+            "back": unbounded(m, dtype=torch.float64),
             "leg": unbounded(m, dtype=torch.float64),
             "departed": unbounded(m),
             "ready": unbounded(m),
@@ -95,7 +99,6 @@ class BatchedMTSP(EnvBase):
         seen = {
             "cities": Bounded(-1.0, 1.0, (batch, n, 2), dtype=torch.float32, device=self.device),
             "agents": unbounded(m, 3, dtype=torch.float32),
-            "visited": Binary(n, (batch, n), dtype=torch.bool, device=self.device),
             "action_mask": Binary(n, (batch, n), dtype=torch.bool, device=self.device),
         }
         done = {
@@ -168,8 +171,7 @@ class BatchedMTSP(EnvBase):
             )
 
     def _over(self, state: rules.State) -> dict[str, torch.Tensor]:
-        terminated = rules.all_visited(state)
-        truncated = (state.decisions >= self.rules.max_decisions) & ~terminated
+        terminated, truncated = rules.all_visited(state), rules.truncated(state, self.rules)
         over = {"done": terminated | truncated, "terminated": terminated, "truncated": truncated}
         return {key: value[:, None] for key, value in over.items()}
 
@@ -189,9 +191,9 @@ class BatchedMTSP(EnvBase):
                 "rand_action needs a TensorDict with the key 'action_mask', as reset() and step() return it"
             )
         legal = tensordict.get("action_mask")
-        rank = torch.rand(legal.shape[0], 1, device=legal.device) * legal.sum(1, keepdim=True)  # in [0, number legal)
-        action = (legal.cumsum(1) <= rank).sum(1)
-        return tensordict.set("action", action)
+        rank = legal.cumsum(1, dtype=torch.int32)  # (B, n) a legal node's is one above that of the legal one before
+        drawn = torch.rand(legal.shape[0], 1, device=legal.device) * rank[:, -1:]  # (B, 1) in [0, number of legal ones)
+        return tensordict.set("action", torch.searchsorted(rank, drawn.to(torch.int32), right=True)[:, 0])
 
     def makespan(self, tensordict: TensorDictBase | None = None) -> torch.Tensor:
         """(B,) float64: each row's longest tour so far, return legs counted (the penalty too where truncated)."""

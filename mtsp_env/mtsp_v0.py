@@ -200,7 +200,7 @@ class raw_env(AECEnv, EzPickle):
         """All there is, float32 (3 n + 4 m,): nodes (x, y, visited), agents (destination x, y; g; tour length)."""
         game, m = self.game, self.n_agents
         seen = rules.observe(game, self.rules)
-        per_node = np.concatenate([game.nodes[0], rules.visited(game)[0][:, None]], axis=1)
+        per_node = np.concatenate([game.nodes[0], game.visited[0][:, None]], axis=1)
         per_agent = np.concatenate(
             [game.nodes[0][game.destination[0]], seen.agents[0][:, 2:], game.length[0].reshape(m, 1)], axis=1
         )

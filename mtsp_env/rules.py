@@ -68,11 +68,18 @@ def make_rules(
 
 
 class State(NamedTuple):
-    """A batch of games. Lengths are float64, ticks and indices int64."""
+    """A batch of games. Lengths are float64, ticks, counts and indices int64.
+
+    ``visited``, ``cities_left``, ``trips`` and ``back`` could be derived; kept, they cost less than their derivation does.
+    """
 
     nodes: Array  # (B, n, 2)  coordinates; row 0 is the depot
+    visited: Array  # (B, n)   bool, the global mask M: a city counts from when an agent sets off for it, the depot never
+    cities_left: Array  # (B,) number of unvisited cities
+    trips: Array  # (B,)       length of out-and-back trips from the depot to all of them
     visits: Array  # (B, n)    who visited a city and when, see `_visit_code`; -1: not visited (the depot: always)
     destination: Array  # (B, m)  node that an agent stands at or heads for
+    back: Array  # (B, m)      distance from there to the depot
     leg: Array  # (B, m)       length of its current leg
     departed: Array  # (B, m)  tick at which it set off on that leg
     ready: Array  # (B, m)     tick at which it arrives and decides; NEVER: its tour is closed
@@ -100,8 +107,12 @@ def start(nodes: Array, n_agents: int) -> State:
 
     return State(
         nodes=nodes,
+        visited=zeros(batch, n_nodes, dtype=xp.bool),
+        cities_left=zeros(batch) + (n_nodes - 1),
+        trips=xp.sum(2.0 * _norm(nodes - nodes[:, :1, :]), axis=1),
         visits=zeros(batch, n_nodes) - 1,
         destination=zeros(batch, n_agents),
+        back=zeros(batch, n_agents, dtype=xp.float64),
         leg=zeros(batch, n_agents, dtype=xp.float64),
         departed=zeros(batch, n_agents),
         ready=zeros(batch, n_agents),
@@ -121,14 +132,9 @@ def now(state: State) -> Array:
     return _pick(state.ready, state.agent)
 
 
-def visited(state: State) -> Array:
-    """(B, n) bool: the paper's global mask M. A city counts as visited from when an agent sets off for it."""
-    return state.visits >= 0
-
-
 def all_visited(state: State) -> Array:
     """(B,) bool: the game is over, all agents terminate at once."""
-    return (state.visits[:, 1:] >= 0).all(1)
+    return state.cities_left == 0
 
 
 def legal_actions(state: State, rules: Rules, agent: Array) -> Array:
@@ -138,14 +144,14 @@ def legal_actions(state: State, rules: Rules, agent: Array) -> Array:
     "final": not before the agent's first city, nor by the last agent still out while cities remain.
     When every city is visited only the depot is legal, so a mask is never empty.
     """
-    mask = state.visits < 0  # (B, n)
+    mask = ~state.visited  # (B, n)
     if rules.depot == "open":
         underway = (state.leg > 0) & (state.ready > now(state)[:, None])
         depot = ((state.destination != 0) | underway).any(1)
     else:
         has_left = _pick(state.destination, agent) != 0
         depot = has_left & ((state.ready < NEVER).sum(1) > 1)
-    mask[:, 0] = depot | ~mask[:, 1:].any(1)
+    mask[:, 0] = depot | all_visited(state)
     return mask
 
 
@@ -157,8 +163,8 @@ def observe(state: State, rules: Rules, agent: Array | None = None) -> Observati
     """
     xp, _ = _library(state.nodes)
     agent = state.agent if agent is None else agent
-    position = _pick(state.nodes, _pick(state.destination, agent))[:, None]  # (B, 1, 2)
-    cities = xp.astype(state.nodes - position, xp.float32)  # (B, n, 2)
+    nodes = xp.astype(state.nodes, xp.float32)  # before the difference: half the bytes, and an error of 1e-7 at most
+    cities = nodes - _pick(nodes, _pick(state.destination, agent))[:, None]  # (B, n, 2)
     heading = _pick_many(cities, state.destination)  # (B, m, 2)
 
     before = _indices(state.ready, axis=1) < agent[:, None]  # (B, m): j < i
@@ -169,7 +175,7 @@ def observe(state: State, rules: Rules, agent: Array | None = None) -> Observati
     return Observation(
         cities=cities,
         agents=xp.concat([heading, xp.astype(remaining, xp.float32)[:, :, None]], axis=2),
-        visited=visited(state),
+        visited=state.visited,
         action_mask=legal_actions(state, rules, agent),
     )
 
@@ -181,17 +187,22 @@ def depart(state: State, rules: Rules, action: Array) -> State:
     neither the makespan nor the tours.
     """
     agent, here, tick = state.agent, _pick(state.destination, state.agent), now(state)
-    leg = _norm(_pick(state.nodes, action) - _pick(state.nodes, here))
+    target, home = _pick(state.nodes, action), action == 0  # (B, 2), (B,)
+    leg, back = _norm(target - _pick(state.nodes, here)), _norm(target - state.nodes[:, 0])
     arrival = tick + travel_ticks(leg, rules.speed)
     if rules.depot == "final":
-        arrival = _library(arrival)[0].where(action == 0, NEVER, arrival)
+        arrival = _library(arrival)[0].where(home, NEVER, arrival)
     visits = _put(state.visits, action, _visit_code(state.decisions, agent, here == 0, state.ready.shape[1]))
     visits[:, 0] = -1  # the depot is never marked
     ready = _put(state.ready, agent, arrival)
     return State(
         nodes=state.nodes,
+        visited=_put(state.visited, action, ~home),
+        cities_left=state.cities_left + home - 1,
+        trips=state.trips - 2.0 * back,
         visits=visits,
         destination=_put(state.destination, agent, action),
+        back=_put(state.back, agent, back),
         leg=_put(state.leg, agent, leg),
         departed=_put(state.departed, agent, tick),
         ready=ready,
@@ -209,26 +220,18 @@ def travel_ticks(leg: Array, speed: float) -> Array:
 
 def makespan(state: State) -> Array:
     """(B,) float64: the longest tour so far, every agent's return leg counted."""
-    back = _norm(_pick_many(state.nodes, state.destination) - state.nodes[:, :1, :])  # (B, m)
-    return _library(back)[0].max(state.length + back, axis=1)
-
-
-def unvisited_trips(state: State) -> Array:
-    """(B,) float64: out-and-back trips to all unvisited cities; what truncation adds, so that stalling never pays."""
-    xp, _ = _library(state.nodes)
-    trips = 2.0 * _norm(state.nodes - state.nodes[:, :1, :])  # (B, n)
-    return xp.sum(xp.where(state.visits < 0, trips, 0.0), axis=1)
+    return _library(state.back)[0].max(state.length + state.back, axis=1)
 
 
 def truncated(state: State, rules: Rules) -> Array:
     """(B,) bool: the game was cut off at ``max_decisions`` with cities left."""
-    return (state.decisions >= rules.max_decisions) & ~all_visited(state)
+    return (state.decisions >= rules.max_decisions) & (state.cities_left > 0)
 
 
 def final_cost(state: State, rules: Rules) -> Array:
-    """(B,) float64: the makespan, plus ``unvisited_trips`` where the game was cut off; minus an episode's rewards."""
-    cut_off = state.decisions >= rules.max_decisions  # with no city left there are no trips to add
-    return makespan(state) + _library(state.nodes)[0].where(cut_off, unvisited_trips(state), 0.0)
+    """(B,) float64: minus an episode's rewards. The makespan; where the game was cut off, out-and-back trips to all
+    unvisited cities on top, so that stalling never pays."""
+    return makespan(state) + _library(state.trips)[0].where(truncated(state, rules), state.trips, 0.0)
 
 
 def reward(before: State, after: State, rules: Rules) -> Array:
@@ -236,7 +239,7 @@ def reward(before: State, after: State, rules: Rules) -> Array:
     cost = final_cost(after, rules)
     if rules.reward == "shaped":
         return makespan(before) - cost
-    over = all_visited(after) | (after.decisions >= rules.max_decisions)
+    over = all_visited(after) | truncated(after, rules)
     return _library(cost)[0].where(over, -cost, 0.0)
 
 
@@ -282,15 +285,15 @@ def _put(array: Array, column: Array, value: Array) -> Array:
         array = array.copy()
         array[:, column[0]] = value
     else:
-        array = _library(array)[0].asarray(array, copy=True)
+        array = array.copy() if type(array) is np.ndarray else array.clone()
         array[_indices(column, axis=0), column] = value
     return array
 
 
 def _norm(vector: Array) -> Array:
     """(...) Lengths of the vectors (..., 2)."""
-    x, y = vector[..., 0], vector[..., 1]
-    return _library(vector)[0].sqrt(x * x + y * y)
+    square = vector * vector
+    return _library(vector)[0].sqrt(square[..., 0] + square[..., 1])
 
 
 # Tours are kept in `visits` as one number per city, so that a state has a fixed shape however long its tours are:
