@@ -13,8 +13,11 @@ import numpy as np
 import pytest
 import torch
 from oracle import Oracle
+from tensordict import TensorDict
+from torchrl.envs.utils import step_mdp
 
 from mtsp_env import Instance, mtsp_v0, rules
+from mtsp_env.batched import BatchedMTSP
 
 # Games: what is played, and by whom
 
@@ -193,10 +196,43 @@ class AECFace:
         return [(info["makespan"], info["tours"]) for info in infos]
 
 
+class BatchedFace:
+    """``BatchedMTSP``, stepped and read as TorchRL does it."""
+
+    reward_tolerance = 1e-5  # float32
+
+    def __init__(self, nodes: np.ndarray, n_agents: int, how: rules.Rules):
+        size = nodes.shape[1], n_agents, nodes.shape[:1]
+        self.env = BatchedMTSP(*size, how.speed, how.depot, how.reward, how.max_decisions)
+        given = TensorDict({"nodes": torch.tensor(nodes)}, batch_size=nodes.shape[:1])
+        self.td = self.env.reset(given, set_state=True)
+
+    def moments(self) -> list[Moment]:
+        columns = [self.td["agent"], self.td["ready"].amin(1)]
+        columns += [self.td[key] for key in ("cities", "agents", "visited", "action_mask")]
+        return [Moment(*row) for row in zip(*(column.numpy() for column in columns), strict=True)]
+
+    def step(self, actions: list[int]) -> None:
+        any_legal = self.td["action_mask"].to(torch.uint8).argmax(1)  # a row that is over: anything that it may do
+        action = torch.where(self.td["done"][:, 0], any_legal, torch.tensor(actions))
+        self.td = step_mdp(self.env.step(self.td.set("action", action)), exclude_reward=False)
+
+    def rewards(self) -> list[float]:
+        return self.td["reward"][:, 0].tolist()
+
+    def over(self) -> list[tuple[bool, bool]]:
+        assert torch.equal(self.td["done"], self.td["terminated"] | self.td["truncated"])
+        return list(zip(self.td["terminated"][:, 0].tolist(), self.td["truncated"][:, 0].tolist(), strict=True))
+
+    def outcomes(self) -> list[tuple[float, list[list[int]]]]:
+        return list(zip(self.env.makespan(self.td).tolist(), self.env.tours(self.td), strict=True))
+
+
 FACES: dict[str, Callable] = {
     "numpy": partial(RulesFace, np.array),
     "torch": partial(RulesFace, torch.tensor),
     "aec": AECFace,
+    "batched": BatchedFace,
 }
 
 
