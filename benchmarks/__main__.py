@@ -28,7 +28,8 @@ def speed(device: str = "cpu", seconds: float = 3.0) -> None:
 @app.command
 def gap(
     set: str = "first",
-    methods: tuple[str, ...] = ("random", "nearest", "dan-greedy", "dan-s64"),
+    methods: tuple[str, ...] = ("random", "nearest", "dan-greedy", "dan-s64", "reference"),
+    seconds: float = 0.1,
     seed: int = SEED,
     out: Path | None = None,
 ) -> None:
@@ -37,12 +38,13 @@ def gap(
     Args:
         set: name of the test set.
         methods: names of solvers.
+        seconds: for each instance, where a solver goes on for as long as it may.
         seed: of the set's instances; best known tours are kept for 7.
         out: file for the table, beside the terminal.
     """
     from benchmarks import table
 
-    text = table.markdown(set, table.gaps(set, list(methods), seed))
+    text = table.markdown(set, table.gaps(set, list(methods), seed, seconds))
     print(text)
     if out is not None:
         out.write_text(f"Set {set!r}, seed {seed}; mean gap ± standard error.\n\n{text}\n")

@@ -4,7 +4,7 @@ After Christiaens & Vanden Berghe 2020, "Slack Induction by String Removals for 
 MinMax mTSP's objective: the makespan plus ``TOTAL_WEIGHT`` times the total length. An iteration removes strings of
 neighbouring cities from a few tours, puts them back greedily, and keeps the result or undoes it (simulated annealing).
 
-No iteration does O(n) work: cities go next to one of their ``N_NEAR`` nearest cities or next to the depot, lengths are
+An iteration does O(m) work and none that grows with n: cities go next to one of their ``N_NEAR`` nearest cities or next to the depot, lengths are
 kept up to date, a rejected change is undone from a log, and tours are linked lists. In these, nodes 1..n-1 are the
 cities, and node n + a is agent a's own copy of the depot, both the start and the end of its tour; node 0 is unused.
 

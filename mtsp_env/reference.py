@@ -52,7 +52,8 @@ def improve(
         tours: where to start; where they are worse than greedy insertion, or None, it starts from that.
         seconds: of wall time, above 0. Preparation is O(n^2), and is not cut short: 0.02 s at n = 1000.
             Compiling or loading the kernels, once per process, does not count.
-        iterations: at least 0, of 2 to 4 microseconds each; the result then depends on nothing but the arguments.
+        iterations: at least 0; 2 to 4 microseconds each, longer with hundreds of agents. Without ``seconds`` the result
+            depends on nothing but the arguments.
         seed: a whole number of at least 0.
 
     Returns:
@@ -169,7 +170,7 @@ def _anneal(
         hot, cold = temperature(now, done), temperature(now + turn * per_iteration, done + turn)
         best = _sisr.anneal(search, turn, hot, cold, best, enough)
         before, now = now, time.perf_counter()
-        per_iteration = (now - before) / turn
+        per_iteration = max((now - before) / turn, 1e-7)  # a coarse clock may not have moved
         done += turn
 
 

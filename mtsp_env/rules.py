@@ -74,7 +74,9 @@ class State(NamedTuple):
     """
 
     nodes: Array  # (B, n, 2)  coordinates; row 0 is the depot
-    visited: Array  # (B, n)   bool, the global mask M: a city counts from when an agent sets off for it, the depot never
+    visited: (
+        Array  # (B, n)   bool, the global mask M: a city counts from when an agent sets off for it, the depot never
+    )
     cities_left: Array  # (B,) number of unvisited cities
     trips: Array  # (B,)       length of out-and-back trips from the depot to all of them
     visits: Array  # (B, n)    who visited a city and when, see `_visit_code`; -1: not visited (the depot: always)

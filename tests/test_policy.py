@@ -6,6 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
+from torchrl.collectors import Collector
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from benchmarks.policies.nearest import nearest
@@ -152,3 +153,23 @@ def test_bad_arguments_are_named(network, kwargs, message):
         solve(uniform(np.random.default_rng(0), 5, 2), network, **kwargs)
     with pytest.raises(FileNotFoundError, match="no weights at nobody"):
         solve(uniform(np.random.default_rng(0), 5, 2), "nobody")
+
+
+def test_torchrls_collector_gathers_whole_episodes(network):
+    """Each batch starts from resets and is as long as the cap of the rule "final", n - 1 + m decisions."""
+    cap = 8 - 1 + 3
+    collector = Collector(
+        BatchedMTSP(8, 3, [4], depot="final", seed=0),
+        make_actor(network),
+        frames_per_batch=4 * cap,
+        total_frames=2 * 4 * cap,
+        reset_at_each_iter=True,
+        auto_register_policy_transforms=False,
+    )
+    batches = list(collector)
+    collector.shutdown()
+    assert len(batches) == 2
+    for batch in batches:
+        assert batch.shape == (4, cap)
+        assert (batch["decisions"][:, 0] == 0).all() and batch["next", "done"].any(1).all()
+        assert batch["action_mask"].gather(2, batch["action"][..., None]).all()

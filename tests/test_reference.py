@@ -70,15 +70,17 @@ def instances_and_tours(draw: st.DrawFn) -> tuple[Instance, Tours]:
 
 @pytest.fixture
 def turns(monkeypatch) -> list[tuple[int, float, float]]:
-    """The calls of the annealing kernel: iterations, temperature at the start, temperature at the end."""
+    """The calls of the annealing kernel: iterations, first and last temperature. Each iteration takes 0.1 ms."""
     calls, anneal = [], _sisr.anneal
     reference._compile()
 
-    def note_and_anneal(search, iterations, hot, cold, best, enough):
+    def noted(search, iterations, hot, cold, best, enough):
         calls.append((iterations, hot, cold))
         return anneal(search, iterations, hot, cold, best, enough)
 
-    monkeypatch.setattr(_sisr, "anneal", note_and_anneal)
+    clock = SimpleNamespace(perf_counter=lambda: 5.0 + 1e-4 * sum(iterations for iterations, _, _ in calls))
+    monkeypatch.setattr(_sisr, "anneal", noted)
+    monkeypatch.setattr(reference, "time", clock)
     return calls
 
 
@@ -103,13 +105,14 @@ def test_small_instances_are_solved_to_the_optimum(n_nodes: int, n_agents: int) 
 
 
 def test_a_few_milliseconds_are_nearly_enough() -> None:
-    """n = 50, m = 5: 2000 iterations stay within 1 % of 20,000, on average; greedy insertion is a fifth off."""
+    """n = 50, m = 5: 2000 iterations stay within 1 % of 20,000, on average; greedy insertion does not within 15 %."""
     nodes = np.random.default_rng(0).random((20, 50, 2))
     start, short, long = (
         np.mean([makespan(row, tours) for row, tours in zip(nodes, improve_batch(nodes, 5, k), strict=True)])
         for k in (0, 2000, 20000)
     )
-    assert long <= short * 1.001 and short < 1.01 * long < 1.01 * start / 1.2
+    assert long <= short < 1.01 * long
+    assert start > 1.15 * long
 
 
 def test_a_travelling_salesman_goes_round_a_circle() -> None:
@@ -125,7 +128,8 @@ def test_a_travelling_salesman_goes_round_a_circle() -> None:
 def test_no_iterations_leave_greedy_insertion() -> None:
     for seed, (n_nodes, n_agents) in enumerate([(2, 1), (9, 3), (30, 4), (12, 20)]):
         instance = random_instance(seed, n_nodes, n_agents)
-        assert improve(instance, iterations=0) == inserted_greedily(instance)
+        found, expected = improve(instance, iterations=0), inserted_greedily(instance)
+        assert [min(tour, tour[::-1]) for tour in found] == [min(tour, tour[::-1]) for tour in expected]
 
 
 # What holds for any instance
@@ -157,16 +161,20 @@ def test_optimal_tours_come_back_as_they_are(square: Instance, square_tours: Tou
     improved[0].reverse()
     assert improved != square_tours  # a copy
 
+    idle_first = [[0, 0], [0, 2, 0, 1, 0]]  # and by way of the depot, where the cities lie
+    assert improve(Instance([[0.5, 0.5]] * 3, n_agents=2), idle_first, iterations=100) == idle_first
 
-def test_the_search_starts_from_given_tours_that_beat_greedy_insertion() -> None:
-    instance = random_instance(3, 60, 4)
-    good = improve(instance, iterations=3000)
-    # hot enough to lose them, too short to find as good ones anew
-    assert makespan(instance.nodes, improve(instance, good, iterations=5)) <= makespan(instance.nodes, good)
-    nearly = [tour[:2] + tour[3:1:-1] + tour[4:] if len(tour) > 5 else tour for tour in good]
-    rescued = min(makespan(instance.nodes, improve(instance, nearly, iterations=300, seed=s)) for s in range(5))
-    anew = min(makespan(instance.nodes, improve(instance, iterations=300, seed=s)) for s in range(5))
-    assert rescued < anew
+
+def test_the_search_starts_from_the_given_tours_or_greedy_insertion(monkeypatch) -> None:
+    """From the better of the two."""
+    instance, starts = random_instance(3, 60, 3), []
+    good, greedy = improve(instance, iterations=1000), improve(instance, iterations=0)
+    bad = [[0, *range(1, 60), 0], [0, 0], [0, 0]]
+    monkeypatch.setattr(_sisr, "anneal", lambda search, iterations, hot, cold, best, enough: starts.append(best))
+    assert improve(instance, good) == good
+    assert improve(instance, bad) == greedy
+    assert starts == pytest.approx([makespan(instance.nodes, good), makespan(instance.nodes, greedy)])
+    assert starts[0] < starts[1]
 
 
 @pytest.mark.parametrize("nodes", [[[0.25, 0.5]] * 5, [[0.0, 0.0], *[[1.0, 1.0]] * 6]], ids=["one place", "two places"])
@@ -174,11 +182,7 @@ def test_the_search_starts_from_given_tours_that_beat_greedy_insertion() -> None
 def test_coincident_cities(nodes: list, n_agents: int) -> None:
     """All cities in one place: the first agent there can visit all of them, which is optimal."""
     instance = Instance(nodes, n_agents)
-    assert makespan(instance.nodes, improve(instance, iterations=10)) == lower_bound_of_one_place(nodes)
-
-
-def lower_bound_of_one_place(nodes: list) -> float:
-    return 2 * math.dist(nodes[0], nodes[1])
+    assert makespan(instance.nodes, improve(instance, iterations=10)) == 2 * math.dist(*nodes[:2])
 
 
 # When it ends
@@ -187,7 +191,7 @@ def lower_bound_of_one_place(nodes: list) -> float:
 @pytest.mark.parametrize("limit", [{"iterations": 10**15}, {"seconds": 1e9}, {"iterations": 10**15, "seconds": 1e9}])
 def test_the_search_ends_at_the_lower_bound(limit: dict) -> None:
     """It would not end otherwise; with 20 agents the farthest city alone makes the makespan."""
-    instance = random_instance(4, 60, 20)
+    instance = random_instance(0, 60, 20)
     assert makespan(instance.nodes, improve(instance, iterations=0)) > lower_bound(instance) + 1e-3
     assert makespan(instance.nodes, improve(instance, **limit)) <= lower_bound(instance) + 1e-9
 
@@ -203,24 +207,21 @@ def test_iterations_cool_down_once(turns: list) -> None:
     ]
 
 
-def test_seconds_cool_down_by_the_clock(turns: list, monkeypatch) -> None:
-    """On a clock that is 1 ms on at every look, 1 s is over after 1000 looks, the first of them at the start."""
-    looks = itertools.count()
-    monkeypatch.setattr(reference, "time", SimpleNamespace(perf_counter=lambda: next(looks) * 1e-3))
-    improve(random_instance(5, 40, 3), seconds=1.0)
-    assert next(looks) == pytest.approx(1001, abs=2)
-    _, hot, cold = np.array(turns).T
-    assert cold[-1] / hot[0] == pytest.approx(COLD / HOT, rel=0.02)
-    assert (cold <= hot).all() and hot[1:] / hot[:-1] == pytest.approx((COLD / HOT) ** 1e-3, rel=1e-3)
+def test_seconds_cool_down_by_the_clock(turns: list) -> None:
+    """Half a second is over after 5000 iterations, in turns of about a hundredth of it, each as cold as the next."""
+    improve(random_instance(5, 40, 3), seconds=0.5)
+    iterations, hot, cold = np.array(turns).T
+    assert 5000 <= iterations.sum() <= 5050
+    assert iterations[1:].max() <= 51
+    done = np.cumsum(iterations)
+    assert cold[1:] / hot[0] == pytest.approx((COLD / HOT) ** np.minimum(done[1:] / 5000, 1.0))
+    assert hot[2:] == pytest.approx(cold[1:-1])
 
 
-@pytest.mark.parametrize(("seconds", "at_most"), [(1e9, 1234), (0.05, 10**15)])
-def test_the_first_limit_counts(turns: list, monkeypatch, seconds: float, at_most: int) -> None:
-    looks = itertools.count()
-    monkeypatch.setattr(reference, "time", SimpleNamespace(perf_counter=lambda: next(looks) * 1e-4))
-    improve(random_instance(5, 40, 3), seconds=seconds, iterations=at_most)
-    done = sum(iterations for iterations, _, _ in turns)
-    assert done == at_most if seconds > 1 else 0 < done < at_most
+@pytest.mark.parametrize(("seconds", "iterations", "done"), [(1e9, 1234, 1234), (0.1, 10**15, 1000)])
+def test_the_first_limit_counts(turns: list, seconds: float, iterations: int, done: int) -> None:
+    improve(random_instance(5, 40, 3), seconds=seconds, iterations=iterations)
+    assert done <= sum(turn for turn, _, _ in turns) <= min(done * 1.02, iterations)
 
 
 # Same seed, same tours

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from benchmarks.solvers import policy
+from benchmarks.solvers import policy, reference
 from mtsp_env.instance import Instance, Tours
 
 Solve = Callable[[Instance, float, int], Tours]
@@ -15,6 +15,7 @@ SOLVERS: dict[str, Solve] = {
     "nearest": policy.nearest,
     "dan-greedy": partial(policy.dan, samples=None),
     "dan-s64": partial(policy.dan, samples=64),
+    "reference": reference.solve,
 }
 
 
