@@ -70,7 +70,7 @@ def make_rules(
 class State(NamedTuple):
     """A batch of games. Lengths are float64, ticks, counts and indices int64.
 
-    ``visited``, ``cities_left``, ``trips`` and ``back`` could be derived; kept, they cost less than their derivation does.
+    ``visited``, ``cities_left``, ``trips`` and ``back`` could be derived; to keep them costs less.
     """
 
     nodes: Array  # (B, n, 2)  coordinates; row 0 is the depot
