@@ -4,9 +4,10 @@ After Christiaens & Vanden Berghe 2020, "Slack Induction by String Removals for 
 MinMax mTSP's objective: the makespan plus ``TOTAL_WEIGHT`` times the total length. An iteration removes strings of
 neighbouring cities from a few tours, puts them back greedily, and keeps the result or undoes it (simulated annealing).
 
-An iteration does O(m) work and none that grows with n: cities go next to one of their ``N_NEAR`` nearest cities or next to the depot, lengths are
-kept up to date, a rejected change is undone from a log, and tours are linked lists. In these, nodes 1..n-1 are the
-cities, and node n + a is agent a's own copy of the depot, both the start and the end of its tour; node 0 is unused.
+An iteration does O(m) work and none that grows with n: cities go next to one of their ``N_NEAR`` nearest cities or next
+to the depot, lengths are kept up to date, a rejected change is undone from a log, and tours are linked lists. In these,
+nodes 1..n-1 are the cities, and node n + a is agent a's own copy of the depot, both the start and the end of its tour;
+node 0 is unused.
 
 The kernels share one file because Numba's cache on disk sees no change in other files than a compiled function's own.
 """
@@ -94,20 +95,24 @@ def insert_greedily(search: Search, order: np.ndarray) -> None:
 
 
 @njit(cache=True, nogil=True)
-def load_tours(search: Search, cities: np.ndarray, agents: np.ndarray) -> None:
-    """Make the tours anew: ``cities`` (n - 1,), in this order, on the tours of ``agents`` (n - 1,)."""
+def load_tours(search: Search, order: np.ndarray) -> None:
+    """Make the tours anew from ``order`` (n - 1 + m,): the cities of each tour and then a 0."""
     depot = search.tour.shape[0] - search.length.shape[0]
     search.count[:] = 0
     for node in range(depot, search.tour.shape[0]):
         search.previous[node] = search.next[node] = node
-    for i in range(cities.shape[0]):
-        _link(search, cities[i], search.previous[depot + agents[i]])
+    home = depot
+    for node in order:
+        if node == 0:
+            home += 1
+        else:
+            _link(search, node, search.previous[home])
     search.best[:] = search.next
 
 
 @njit(cache=True, nogil=True)
 def best_order(search: Search) -> np.ndarray:
-    """The best tours so far, int64 (n - 1 + m,): the cities of each tour and then a 0."""
+    """The best tours so far, int64 (n - 1 + m,), as ``load_tours`` takes them."""
     n_agents = search.length.shape[0]
     depot = search.tour.shape[0] - n_agents
     order = np.zeros(depot - 1 + n_agents, np.int64)

@@ -83,12 +83,12 @@ class BatchedMTSP(EnvBase):
 
         state = {
             "nodes": Bounded(0.0, 1.0, (batch, n, 2), dtype=torch.float64, device=self.device),
+            "home": unbounded(n, dtype=torch.float64),
             "visited": Binary(n, (batch, n), dtype=torch.bool, device=self.device),
             "cities_left": unbounded(),
             "trips": unbounded(dtype=torch.float64),
             "visits": unbounded(n),
             "destination": unbounded(m),
-            "back": unbounded(m, dtype=torch.float64),
             "leg": unbounded(m, dtype=torch.float64),
             "departed": unbounded(m),
             "ready": unbounded(m),

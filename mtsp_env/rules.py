@@ -1,8 +1,9 @@
 """The rules of the MinMax mTSP as a game of asynchronous decisions (paper, Sec. 4 and Algorithm 1).
 
 Pure functions over arrays with a leading batch dimension B, written against the Python array API: NumPy arrays (the
-PettingZoo environment, B = 1) and torch tensors (the batched TorchRL environment) run the same lines. The clock is
-event-driven: instead of looping over ticks, the next to decide is the agent with the smallest (ready tick, index).
+PettingZoo environment, B = 1) and torch tensors (the batched TorchRL environment) run the same lines; the few primitives
+that differ stand together below. The clock is event-driven: instead of looping over ticks, the next to decide is the
+agent with the smallest (ready tick, index).
 """
 
 from __future__ import annotations
@@ -70,10 +71,11 @@ def make_rules(
 class State(NamedTuple):
     """A batch of games. Lengths are float64, ticks, counts and indices int64.
 
-    ``visited``, ``cities_left``, ``trips`` and ``back`` could be derived; to keep them costs less.
+    ``home``, ``visited``, ``cities_left`` and ``trips`` could be derived; to keep them costs less.
     """
 
     nodes: Array  # (B, n, 2)  coordinates; row 0 is the depot
+    home: Array  # (B, n)      distance from each to the depot
     visited: (
         Array  # (B, n)   bool, the global mask M: a city counts from when an agent sets off for it, the depot never
     )
@@ -81,7 +83,6 @@ class State(NamedTuple):
     trips: Array  # (B,)       length of out-and-back trips from the depot to all of them
     visits: Array  # (B, n)    who visited a city and when, see `_visit_code`; -1: not visited (the depot: always)
     destination: Array  # (B, m)  node that an agent stands at or heads for
-    back: Array  # (B, m)      distance from there to the depot
     leg: Array  # (B, m)       length of its current leg
     departed: Array  # (B, m)  tick at which it set off on that leg
     ready: Array  # (B, m)     tick at which it arrives and decides; NEVER: its tour is closed
@@ -107,14 +108,15 @@ def start(nodes: Array, n_agents: int) -> State:
     def zeros(*shape, dtype=xp.int64):
         return xp.zeros(shape, dtype=dtype, device=on)
 
+    home = _norm(_minus(nodes, nodes[:, 0]))
     return State(
         nodes=nodes,
+        home=home,
         visited=zeros(batch, n_nodes, dtype=xp.bool),
         cities_left=zeros(batch) + (n_nodes - 1),
-        trips=xp.sum(2.0 * _norm(nodes - nodes[:, :1, :]), axis=1),
+        trips=xp.sum(2.0 * home, axis=1),
         visits=zeros(batch, n_nodes) - 1,
         destination=zeros(batch, n_agents),
-        back=zeros(batch, n_agents, dtype=xp.float64),
         leg=zeros(batch, n_agents, dtype=xp.float64),
         departed=zeros(batch, n_agents),
         ready=zeros(batch, n_agents),
@@ -166,7 +168,7 @@ def observe(state: State, rules: Rules, agent: Array | None = None) -> Observati
     xp, _ = _library(state.nodes)
     agent = state.agent if agent is None else agent
     nodes = xp.astype(state.nodes, xp.float32)  # before the difference: half the bytes, and an error of 1e-7 at most
-    cities = nodes - _pick(nodes, _pick(state.destination, agent))[:, None]  # (B, n, 2)
+    cities = _minus(nodes, _pick(nodes, _pick(state.destination, agent)))  # (B, n, 2)
     heading = _pick_many(cities, state.destination)  # (B, m, 2)
 
     before = _indices(state.ready, axis=1) < agent[:, None]  # (B, m): j < i
@@ -189,22 +191,21 @@ def depart(state: State, rules: Rules, action: Array) -> State:
     neither the makespan nor the tours.
     """
     agent, here, tick = state.agent, _pick(state.destination, state.agent), now(state)
-    target, home = _pick(state.nodes, action), action == 0  # (B, 2), (B,)
-    leg, back = _norm(target - _pick(state.nodes, here)), _norm(target - state.nodes[:, 0])
+    leg, is_city = _norm(_pick(state.nodes, action) - _pick(state.nodes, here)), action != 0
     arrival = tick + travel_ticks(leg, rules.speed)
     if rules.depot == "final":
-        arrival = _library(arrival)[0].where(home, NEVER, arrival)
+        arrival = _library(arrival)[0].where(is_city, arrival, NEVER)
     visits = _put(state.visits, action, _visit_code(state.decisions, agent, here == 0, state.ready.shape[1]))
     visits[:, 0] = -1  # the depot is never marked
     ready = _put(state.ready, agent, arrival)
     return State(
         nodes=state.nodes,
-        visited=_put(state.visited, action, ~home),
-        cities_left=state.cities_left + home - 1,
-        trips=state.trips - 2.0 * back,
+        home=state.home,
+        visited=_put(state.visited, action, is_city),
+        cities_left=state.cities_left + ~is_city - 1,
+        trips=state.trips - 2.0 * _pick(state.home, action),
         visits=visits,
         destination=_put(state.destination, agent, action),
-        back=_put(state.back, agent, back),
         leg=_put(state.leg, agent, leg),
         departed=_put(state.departed, agent, tick),
         ready=ready,
@@ -222,7 +223,7 @@ def travel_ticks(leg: Array, speed: float) -> Array:
 
 def makespan(state: State) -> Array:
     """(B,) float64: the longest tour so far, every agent's return leg counted."""
-    return _library(state.back)[0].max(state.length + state.back, axis=1)
+    return _library(state.length)[0].max(state.length + _pick_many(state.home, state.destination), axis=1)
 
 
 def truncated(state: State, rules: Rules) -> Array:
@@ -245,8 +246,9 @@ def reward(before: State, after: State, rules: Rules) -> Array:
     return _library(cost)[0].where(over, -cost, 0.0)
 
 
-# The two libraries. The array API has no quick way to read or write one entry of each row, and NumPy with one row (the
-# PettingZoo environment) is several times faster by a slice than by arrays of indices.
+# The two libraries. What is quick in the one is slow in the other, or missing from the array API: NumPy with one row
+# (the PettingZoo environment) is several times faster by slices than by arrays of indices; torch by `gather`, and by
+# complex numbers than by broadcasting over an axis of two.
 
 _NUMPY = array_namespace(np.empty(0)), "cpu"
 
@@ -276,9 +278,19 @@ def _pick(array: Array, column: Array) -> Array:
 
 def _pick_many(array: Array, columns: Array) -> Array:
     """(B, m, ...) Row b's entries ``columns[b]``, with ``columns`` (B, m), of an array (B, k, ...)."""
-    if type(array) is np.ndarray and len(array) == 1:
+    if type(array) is not np.ndarray:
+        return array.gather(1, columns if array.ndim == 2 else columns[:, :, None].expand(-1, -1, array.shape[2]))
+    if len(array) == 1:
         return array.take(columns[0], axis=1)
     return array[_indices(columns, axis=0)[:, None], columns]
+
+
+def _minus(points: Array, origin: Array) -> Array:
+    """(B, k, 2) Points (B, k, 2) as seen from row b's origin (B, 2)."""
+    if type(points) is np.ndarray:
+        return points - origin[:, None]
+    xp, _ = _library(points)
+    return xp.view_as_real(xp.view_as_complex(points) - xp.view_as_complex(origin)[:, None])
 
 
 def _put(array: Array, column: Array, value: Array) -> Array:
