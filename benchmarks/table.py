@@ -52,4 +52,5 @@ def markdown(name: str, found: dict[str, dict[str, np.ndarray]]) -> str:
 
 
 def _percent(gap: np.ndarray) -> str:
-    return f"{100 * gap.mean():.1f} ± {100 * sem(gap):.1f}"
+    mean = round(100 * gap.mean(), 1) + 0.0  # no -0.0
+    return f"{mean:.1f} ± {100 * sem(gap):.1f}"

@@ -1,7 +1,7 @@
 """The rules of the MinMax mTSP as a game of asynchronous decisions (paper, Sec. 4 and Algorithm 1).
 
 Pure functions over arrays with a leading batch dimension B, written against the Python array API: NumPy arrays (the
-PettingZoo environment, B = 1) and torch tensors (the batched TorchRL environment) run the same lines; the few primitives
+PettingZoo environment, B = 1) and torch tensors (the batched TorchRL environment) run the same lines; the primitives
 that differ stand together below. The clock is event-driven: instead of looping over ticks, the next to decide is the
 agent with the smallest (ready tick, index).
 """
