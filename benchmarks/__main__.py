@@ -32,6 +32,7 @@ def gap(
     seconds: float = 0.1,
     seed: int = SEED,
     out: Path | None = None,
+    plot: Path | None = None,
 ) -> None:
     """Gap of methods to the best known tours of a test set, as a Markdown table.
 
@@ -41,13 +42,17 @@ def gap(
         seconds: for each instance, where a solver goes on for as long as it may.
         seed: of the set's instances; best known tours are kept for 7.
         out: file for the table, beside the terminal.
+        plot: file for a picture of gap against time.
     """
     from benchmarks import table
 
-    text = table.markdown(set, table.gaps(set, list(methods), seed, seconds))
+    found = table.gaps(set, list(methods), seed, seconds)
+    text = table.markdown(set, found)
     print(text)
     if out is not None:
         out.write_text(f"Set {set!r}, seed {seed}; mean gap ± standard error.\n\n{text}\n")
+    if plot is not None:
+        table.plot(set, found, plot)
 
 
 @app.command

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 
 import numpy as np
 from rich.progress import Progress
@@ -54,3 +55,25 @@ def markdown(name: str, found: dict[str, dict[str, np.ndarray]]) -> str:
 def _percent(gap: np.ndarray) -> str:
     mean = round(100 * gap.mean(), 1) + 0.0  # no -0.0
     return f"{mean:.1f} ± {100 * sem(gap):.1f}"
+
+
+def plot(name: str, found: dict[str, dict[str, np.ndarray]], path: Path) -> None:
+    """Mean gap (and its standard error) against mean seconds: a point per method, all instances of the set together."""
+    from matplotlib.figure import Figure
+
+    ax = (figure := Figure(figsize=(6.4, 4.0), layout="constrained")).subplots()
+    for method, rows in found.items():
+        everything = np.concatenate(list(rows.values()))
+        gap, seconds = 100 * everything[:, 0], everything[:, 1].mean()
+        ax.errorbar(seconds, gap.mean(), yerr=sem(gap), fmt="o", capsize=3, label=method)
+        ax.annotate(method, (seconds, gap.mean()), xytext=(8, 4), textcoords="offset points")
+    ax.set_xscale("log")
+    ax.set_yscale("symlog", linthresh=10)
+    ax.set_yticks([0, 5, 10, 20, 50, 100, 200], ["0", "5", "10", "20", "50", "100", "200"])
+    ax.set(xlabel="seconds per instance", ylabel="gap to the best known tours, %", ylim=(-1, None))
+    ax.set_title(f"{sum(cell.count for cell in cells(name))} uniform instances", fontsize=11)
+    ax.margins(x=0.25)
+    ax.spines[["top", "right"]].set_visible(False)
+    temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
+    figure.savefig(temporary, dpi=130)
+    temporary.replace(path)

@@ -81,6 +81,8 @@ def test_a_gap_table_is_measured_by_the_judge(tmp_path, monkeypatch):
     assert np.allclose(found["fixed"]["8x2"][:, 0], gap)
     error = gap.std(ddof=1) / np.sqrt(3)
     assert f"| fixed | {100 * gap.mean():.1f} ± {100 * error:.1f} |" in table.markdown("smoke", found)
+    table.plot("smoke", found, tmp_path / "gaps.png")
+    assert (tmp_path / "gaps.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_speed_is_work_over_time(monkeypatch):
