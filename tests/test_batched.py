@@ -113,6 +113,8 @@ def test_partial_resets_leave_other_rows_bit_identical():
         assert torch.equal(after[key][~reset], before[key][~reset]), key
     assert (after["decisions"][reset] == 0).all()
     assert not torch.equal(after["nodes"][reset], before["nodes"][reset])
+    fresh = after["nodes"][reset]  # (2, n, 2), instances of their own
+    assert not torch.equal(fresh[0], fresh[1]) and (fresh.std(1) > 0.05).all()
 
 
 @pytest.mark.parametrize("depot", ["open", "final"])

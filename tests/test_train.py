@@ -30,6 +30,8 @@ TINY = replace(
     validate_every=2,
     validation_instances=8,
     checkpoint_every=2,
+    decay=0.5,
+    decay_every=2,
     steps=6,
     tensorboard=False,
 )
@@ -241,7 +243,8 @@ def test_logs_and_weights_are_left_behind(tmp_path):
 def test_training_lowers_the_greedy_cost_on_held_out_instances(tmp_path):
     """A minute of training in small: 200 steps at n = 10, m = 2."""
     config = replace(
-        TINY, out=tmp_path, n_nodes=(10, 10), n_agents=(2, 2), batch_size=64, steps=200, seed=1, learning_rate=1e-3,
+        TINY, out=tmp_path, n_nodes=(10, 10), n_agents=(2, 2), batch_size=64, steps=200, seed=1,
+        learning_rate=1e-3, decay_every=1000,
         network=DANConfig(embed_dim=64, feedforward_dim=128, n_heads=4, city_layers=1, prune_visited=True),
         challenge_every=20, challenge_instances=128, validate_every=1000, checkpoint_every=1000,
     )  # fmt: skip
@@ -249,7 +252,7 @@ def test_training_lowers_the_greedy_cost_on_held_out_instances(tmp_path):
     before = costs(Trainer(config).network, held_out, config)
     after = costs(reinforce(config).network, held_out, config)
     assert better(after, before, 1e-6)
-    assert after.mean() < 0.8 * before.mean()
+    assert after.mean() < 0.65 * before.mean()  # 0.57; the nearest city: 0.60
 
 
 @pytest.mark.parametrize(
