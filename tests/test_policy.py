@@ -10,7 +10,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from benchmarks.policies.nearest import nearest
-from dan_policy import DAN, DANConfig, make_actor, rollout, solve
+from dan_policy import DAN, DANConfig, make_actor, rollout, solution, solve
 from mtsp_env import Instance, check_tours, makespan, mtsp_v0, uniform
 from mtsp_env.batched import BatchedMTSP
 
@@ -173,3 +173,21 @@ def test_torchrls_collector_gathers_whole_episodes(network):
         assert batch.shape == (4, cap)
         assert (batch["decisions"][:, 0] == 0).all() and batch["next", "done"].any(1).all()
         assert batch["action_mask"].gather(2, batch["action"][..., None]).all()
+
+
+@pytest.mark.parametrize(("decode", "clip"), [("sample", 100.0), ("greedy", 10.0)])
+def test_large_instances_are_sampled_with_the_papers_sharper_clip(network, monkeypatch, decode, clip):
+    """Sec. 6.1: C = 100 from n = 500 on, for samples alone."""
+    clips = []
+    rollout = solution.rollout
+
+    def watched(actor, *args):
+        clips.append(next(m for m in actor.modules() if isinstance(m, DAN)).config.tanh_clip)
+        return rollout(actor, *args)
+
+    monkeypatch.setattr(solution, "rollout", watched)
+    monkeypatch.setattr(solution, "SHARP_FROM", 12)
+    solve(uniform(np.random.default_rng(0), 12, 3), network, decode, samples=2)
+    solve(uniform(np.random.default_rng(0), 11, 3), network, decode, samples=2)
+    assert clips == [clip, 10.0]
+    assert network.config.tanh_clip == 10.0  # the given network stays as it is
