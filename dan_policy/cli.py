@@ -1,4 +1,4 @@
-"""The command ``mtsp``: solve instances from files, generate instances. Imports torch only to solve."""
+"""The command ``mtsp``: solve instances from files, generate instances. Imports torch only to solve with a policy."""
 
 from __future__ import annotations
 
@@ -7,22 +7,24 @@ import json
 import math
 import re
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 
-from mtsp_env.instance import DISTRIBUTIONS, Instance, read_instance, sample_nodes, write_instance, write_tours
+from mtsp_env.instance import DISTRIBUTIONS, Instance, Tours, read_instance, sample_nodes, write_instance, write_tours
 from mtsp_env.render import check_suffix, format_lengths, save_picture
 from mtsp_env.tours import lower_bound, tour_lengths
 from mtsp_env.tsplib import read_tsplib
 from mtsp_env.version import __version__
 
-if TYPE_CHECKING:
-    from dan_policy.solution import Solution
-
+METHODS = {  # each with the options that are its own
+    "dan": ("policy", "decode", "samples", "device", "improve"),
+    "reference": ("seconds",),
+}
 DEFAULT_SAMPLES = 64  # the paper's DAN(s.64)
 
 
@@ -47,27 +49,26 @@ def main(argv: Sequence[str] | None = None) -> int:
 # mtsp solve: everything that can be wrong with the input is found before the first instance is solved
 
 
+class Plan(NamedTuple):
+    """What the output needs of a Solution, whose own module imports torch."""
+
+    tours: Tours
+    seconds: float
+    method: str
+
+
 def _solve(args: argparse.Namespace) -> None:
-    if args.samples is not None and args.decode != "sample":
-        raise ValueError("--samples needs --decode sample")
+    _check_options(args)
     instances = [_read(Path(file), args.agents) for file in args.files]
     plots, outs = _outputs(args.plot, instances), _outputs(args.out, instances)
     _check_outputs(args.files, plots, outs)
-    try:
-        from dan_policy import solve
-    except ImportError as error:
-        raise ImportError(f'solving needs torch and torchrl ({error}): pip install "mtsp-env[dan]"') from error
+    solve = {"dan": _dan, "reference": _reference}[args.method](args)
+    if not args.json:
+        _check_table()
 
     for instance, plot, out in zip(instances, plots, outs, strict=True):
-        solution = solve(
-            instance,
-            policy=args.policy,
-            decode=args.decode,
-            samples=args.samples or DEFAULT_SAMPLES,
-            seed=args.seed,
-            device=args.device,
-        )
-        record = _record(instance, solution)
+        plan = solve(instance)
+        record = _record(instance, plan)
         if args.json:
             print(json.dumps(record), flush=True)
         else:
@@ -77,7 +78,57 @@ def _solve(args: argparse.Namespace) -> None:
                 write_tours(out, **record)
         if plot is not None:
             with _writing(plot, quiet=args.json):
-                save_picture(plot, instance, solution.tours)
+                save_picture(plot, instance, plan.tours)
+
+
+def _check_options(args: argparse.Namespace) -> None:
+    for method, options in METHODS.items():
+        given = [option for option in options if getattr(args, option) is not None]
+        if given and method != args.method:
+            raise ValueError(f"--{given[0]} needs --method {method}")
+    if args.samples is not None and args.decode != "sample":
+        raise ValueError("--samples needs --decode sample")
+
+
+def _dan(args: argparse.Namespace) -> Callable[[Instance], Plan]:
+    try:
+        from dan_policy import solve
+    except ImportError as error:
+        raise ImportError(f'solving needs torch and torchrl ({error}): pip install "mtsp-env[dan]"') from error
+
+    def plan(instance: Instance) -> Plan:
+        solution = solve(
+            instance,
+            policy=args.policy or "default",
+            decode=args.decode or "greedy",
+            samples=args.samples or DEFAULT_SAMPLES,
+            seed=args.seed,
+            device=args.device or "cpu",
+            improve=args.improve,
+        )
+        return Plan(solution.tours, solution.seconds, solution.method)
+
+    return plan
+
+
+def _reference(args: argparse.Namespace) -> Callable[[Instance], Plan]:
+    from mtsp_env import reference
+
+    reference.compile_kernels()
+
+    def plan(instance: Instance) -> Plan:
+        start = time.perf_counter()
+        tours = reference.improve(instance, seconds=args.seconds, seed=args.seed)
+        return Plan(tours, time.perf_counter() - start, "reference")
+
+    return plan
+
+
+def _check_table() -> None:
+    try:
+        import rich  # noqa: F401
+    except ImportError as error:
+        raise ImportError(f'the table needs rich ({error}): pip install "mtsp-env[dan]", or add --json') from error
 
 
 def _read(path: Path, n_agents: int | None) -> Instance:
@@ -117,19 +168,19 @@ def _check_outputs(files: Sequence[str], plots: Sequence[Path | None], outs: Seq
         check_suffix(plot)
 
 
-def _record(instance: Instance, solution: Solution) -> dict:
-    """What there is to say about a solution, in the file's units; measured by the judge, not by the solver."""
-    lengths = tour_lengths(instance.nodes, solution.tours) * instance.scale
+def _record(instance: Instance, plan: Plan) -> dict:
+    """What there is to say about a plan, in the file's units; measured by the judge, not by the solver."""
+    lengths = tour_lengths(instance.nodes, plan.tours) * instance.scale
     return {
         "name": instance.name,
         "n_nodes": instance.n_nodes,
         "n_agents": instance.n_agents,
-        "method": solution.method,
-        "seconds": solution.seconds,
+        "method": plan.method,
+        "seconds": plan.seconds,
         "makespan": float(lengths.max()),
         "lower_bound": lower_bound(instance) * instance.scale,
         "lengths": lengths.tolist(),
-        "tours": [[int(node) for node in tour] for tour in solution.tours],
+        "tours": [[int(node) for node in tour] for tour in plan.tours],
     }
 
 
@@ -230,12 +281,14 @@ def _parser() -> argparse.ArgumentParser:
 
     solve = commands.add_parser(
         "solve",
-        help="plan tours with a trained policy",
-        description="Plan tours with a trained policy and print them; lengths are in the file's units.",
+        help="plan tours with a trained policy or the reference solver",
+        description="Plan tours and print them; lengths are in the file's units.",
         epilog="examples:\n"
         "  mtsp solve examples/europe.tsp --agents 5 --plot tours.png\n"
         "  mtsp solve a.tsp b.tsp --agents 4 --out tours.json     (writes tours-a.json, tours-b.json)\n"
-        "  mtsp solve big.json --decode sample --samples 256 --device cuda --json",
+        "  mtsp solve big.json --decode sample --samples 256 --device cuda --json\n"
+        "  mtsp solve big.json --improve 1                        (go on from the policy's tours for a second)\n"
+        "  mtsp solve big.json --method reference --seconds 0.1   (the shortest tours soonest, no policy)",
         formatter_class=layout,
         allow_abbrev=False,
     )
@@ -243,16 +296,25 @@ def _parser() -> argparse.ArgumentParser:
     option = solve.add_argument
     option("files", nargs="+", metavar="FILE", help="TSPLIB (.tsp) or what `mtsp generate` wrote (.json)")
     option("--agents", type=_whole(1), metavar="M", help="number of agents; default: what a .json file says")
-    option("--policy", default="default", help="a shipped policy or a .safetensors file (default: %(default)s)")
+    option("--seed", type=_whole(0), default=0, metavar="S", help="of all that is random (default: %(default)s)")
+    option(
+        "--method",
+        choices=METHODS,
+        default="dan",
+        help="a trained policy, or the reference solver alone, which needs no torch (default: %(default)s)",
+    )
+    option(
+        "--seconds", type=_seconds, metavar="SECONDS", help="--method reference: per file (default: 500 n iterations)"
+    )
+    option("--policy", help="--method dan: a shipped policy or a .safetensors file (default: default)")
     option(
         "--decode",
         choices=("greedy", "sample"),
-        default="greedy",
-        help="likeliest actions once, or the best of --samples draws (default: %(default)s)",
+        help="--method dan: likeliest actions once, or the best of --samples draws (default: greedy)",
     )
     option("--samples", type=_whole(1), metavar="K", help=f"with --decode sample (default: {DEFAULT_SAMPLES})")
-    option("--seed", type=_whole(0), default=0, metavar="S", help="of the samples (default: %(default)s)")
-    option("--device", default="cpu", help="cpu, cuda, cuda:1, ... (default: %(default)s)")
+    option("--device", help="--method dan: cpu, cuda, cuda:1, ... (default: cpu)")
+    option("--improve", type=_seconds, metavar="SECONDS", help="--method dan: polish its tours for so many seconds")
     option("--plot", metavar="PATH", help="draw the tours: .png, .svg, .pdf, ...")
     option("--out", metavar="PATH", help="write the tours as JSON")
     option("--json", action="store_true", help="print one JSON object per file and nothing else")
@@ -290,6 +352,17 @@ def _whole(minimum: int) -> Callable[[str], int]:
         return int(value)
 
     return parse
+
+
+def _seconds(text: str) -> float:
+    """A type for argparse: a finite number above 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0):
+        raise argparse.ArgumentTypeError(f"must be a finite number of seconds above 0, got {text!r}")
+    return value
 
 
 if __name__ == "__main__":

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import torch
 from torch import nn
@@ -29,8 +30,8 @@ class Solution:
     Attributes:
         tours: one per agent, each from depot to depot.
         makespan: the longest tour, in unit-square units; times ``instance.scale`` it is in the source's.
-        seconds: wall-clock time of the planning, without loading the weights.
-        method: for tables, e.g. "dan(g.)" or "dan(s.64)".
+        seconds: wall-clock time of the planning, improvement included, without loading weights or compiling kernels.
+        method: for tables, e.g. "dan(g.)", "dan(s.64)" or "dan(g.)+improve(1 s)".
     """
 
     tours: Tours
@@ -46,8 +47,9 @@ def solve(
     samples: int = 64,
     seed: int = 0,
     device: torch.device | str | None = None,
+    improve: float | None = None,
 ) -> Solution:
-    """Plan the team's tours with a policy (paper, Sec. 6: DAN(g.) and DAN(s.64)).
+    """Plan the team's tours with a policy (paper, Sec. 6: DAN(g.) and DAN(s.64)), and polish them where asked to.
 
     The games are played with the depot rule "final", so that tours are complete whatever the policy does.
 
@@ -56,16 +58,21 @@ def solve(
             ``make_actor``.
         decode: "greedy": one game of likeliest actions. "sample": ``samples`` games of drawn ones, the best counts.
         samples: games played side by side where ``decode`` is "sample", at least 1.
-        seed: of the samples; the same call gives the same tours on the same machine.
+        seed: of the samples and of the improvement; without the latter, which goes by the clock, the same call gives
+            the same tours on the same machine.
         device: None takes a GPU where there is one.
+        improve: seconds, above 0, for which ``mtsp_env.reference.improve`` goes on from the policy's tours; it never
+            makes them worse (extra ``reference``). None: the tours stay as they are.
 
     Raises:
+        ImportError: ``improve`` without Numba.
         OSError: no such weights.
         ValueError: bad weights, or an argument outside its range.
     """
     check_count("samples", samples, minimum=1)
     if decode not in ("greedy", "sample"):
         raise ValueError(f"unknown decode {decode!r}; choose from ['greedy', 'sample']")
+    polish = None if improve is None else _polish(improve, seed)
     device = find_device(device)
     sharp = decode == "sample" and instance.n_nodes >= SHARP_FROM
     actor = _actor(policy, device, sharp)
@@ -81,11 +88,25 @@ def solve(
         last = rollout(actor, env, decode, nodes).last
     best = env.makespan(last).argmin()[None]
     tours = env.tours(last[best])[0]
+    if polish is not None:
+        tours = polish(instance, tours)
     seconds = time.perf_counter() - start
 
     check_tours(instance, tours)
     method = "dan(g.)" if decode == "greedy" else f"dan(s.{samples})"
+    if polish is not None:
+        method += f"+improve({improve:g} s)"
     return Solution(tours, makespan(instance.nodes, tours), seconds, method)
+
+
+def _polish(seconds: float, seed: int) -> Callable[[Instance, Tours], Tours]:
+    """The reference solver for so many seconds, ready to start."""
+    from mtsp_env import reference  # Numba: only where it is needed
+
+    reference.check_seconds("improve", seconds)
+    check_count("seed", seed, minimum=0)
+    reference.compile_kernels()
+    return partial(reference.improve, seconds=seconds, seed=seed)
 
 
 def _actor(policy: str | os.PathLike | nn.Module, device: torch.device, sharp: bool) -> nn.Module:

@@ -145,13 +145,16 @@ def sum_lengths(search: Search) -> float:
 
 
 @njit(cache=True, nogil=True)
-def anneal(search: Search, iterations: int, hot: float, cold: float, best: float, enough: float) -> float:
+def anneal(
+    search: Search, iterations: int, hot: float, cold: float, best: float, enough: float, weight: float
+) -> float:
     """Simulated annealing of the current tours from temperature ``hot`` to ``cold``, geometric, in units of length.
 
-    ``search.best`` changes whenever the makespan falls below ``best``; one of at most ``enough`` ends the search.
-    Returns the best makespan.
+    ``search.best`` changes whenever the score, the makespan plus ``weight`` times the total length, falls below
+    ``best``; a score of at most ``enough`` ends the search. Returns the best score.
     """
     makespan = sum_lengths(search)
+    total = search.length.sum()
     search.ruined[:] = -1
     temperature, cooling = hot, (cold / hot) ** (1.0 / max(1, iterations))
     for iteration in range(iterations):
@@ -159,6 +162,7 @@ def anneal(search: Search, iterations: int, hot: float, cold: float, best: float
             break
         if iteration % REFRESH == REFRESH - 1:
             makespan = sum_lengths(search)
+            total = search.length.sum()
         n_removed, shrinkage = _ruin(search, iteration, makespan)
         _sort(search, n_removed)
         growth = _recreate(search, n_removed, makespan)
@@ -166,8 +170,10 @@ def anneal(search: Search, iterations: int, hot: float, cold: float, best: float
         worse = new_makespan - makespan + TOTAL_WEIGHT * (growth - shrinkage)
         if worse < -temperature * log(1.0 - _random(search)):
             makespan = new_makespan
-            if makespan < best - FINE:
-                best = makespan
+            total += growth - shrinkage
+            score = makespan + weight * total
+            if score < best - FINE:
+                best = score
                 search.best[:] = search.next
         else:
             _undo(search, n_removed)

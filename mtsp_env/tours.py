@@ -52,6 +52,12 @@ def _cities(numbers: np.ndarray) -> str:
     return f"city {named}" if len(numbers) == 1 else f"cities {named}{', ...' if len(numbers) > 5 else ''}"
 
 
+def farthest_trip(nodes: np.ndarray) -> float:
+    """Length of the trip to the city farthest from the depot and back, which no makespan is below; nodes (n, 2)."""
+    nodes = np.asarray(nodes, dtype=np.float64)
+    return 2.0 * float(np.linalg.norm(nodes - nodes[0], axis=1).max())
+
+
 def lower_bound(instance: Instance) -> float:
     """No makespan is below this: the farthest out-and-back trip, or the minimum spanning tree over m where larger.
 
@@ -59,7 +65,6 @@ def lower_bound(instance: Instance) -> float:
     O(n^2) time, O(n) memory (Prim's algorithm).
     """
     nodes = instance.nodes
-    farthest = 2.0 * float(np.linalg.norm(nodes - nodes[0], axis=1).max())
     distance = np.linalg.norm(nodes - nodes[0], axis=1)  # (n,) of each node to the tree grown so far
     outside = np.ones(len(nodes), dtype=bool)
     outside[0] = False
@@ -69,4 +74,4 @@ def lower_bound(instance: Instance) -> float:
         tree += float(distance[nearest])
         outside[nearest] = False
         distance = np.minimum(distance, np.linalg.norm(nodes - nodes[nearest], axis=1))
-    return max(farthest, tree / instance.n_agents)
+    return max(farthest_trip(nodes), tree / instance.n_agents)

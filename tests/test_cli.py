@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -96,16 +97,41 @@ def test_json_is_the_judges_verdict_in_the_units_of_the_file(folder, solver, cap
     assert found["makespan"] == pytest.approx(max(by_hand))
     assert found["lower_bound"] == pytest.approx(15.0)
     assert solver.calls == [
-        {"policy": "default", "decode": "greedy", "samples": 64, "seed": 0, "device": "cpu"}
+        {"policy": "default", "decode": "greedy", "samples": 64, "seed": 0, "device": "cpu", "improve": None}
     ]  # the defaults that --help names
 
 
 def test_options_reach_the_solver(folder, solver) -> None:
-    options = "--policy a.safetensors --decode sample --samples 7 --seed 5 --device cuda:1 --json"
+    options = "--policy a.safetensors --decode sample --samples 7 --seed 5 --device cuda:1 --improve .5 --json"
     assert main(["solve", "square.json", *options.split()]) == 0
     assert solver.calls == [
-        {"policy": "a.safetensors", "decode": "sample", "samples": 7, "seed": 5, "device": "cuda:1"}
+        {"policy": "a.safetensors", "decode": "sample", "samples": 7, "seed": 5, "device": "cuda:1", "improve": 0.5}
     ]
+
+
+@pytest.fixture
+def improved(monkeypatch) -> list[dict]:
+    """What the reference solver was asked, in a search that takes no time."""
+    reference, calls = pytest.importorskip("mtsp_env.reference", reason="needs the extra reference"), []
+
+    def improve(instance: Instance, **options) -> list[list[int]]:
+        calls.append(options)
+        return [[0, *range(1, instance.n_nodes), 0], *[[0, 0]] * (instance.n_agents - 1)]
+
+    monkeypatch.setattr(reference, "improve", improve)
+    return calls
+
+
+def test_the_reference_solves_in_the_policys_place(folder, solver, improved, capsys) -> None:
+    assert main(["solve", "square.json", "ten.tsp", "--agents", "2", "--json", "--method", "reference"]) == 0
+    assert main(["solve", "square.json", "--json", "--method", "reference", "--seconds", "1.5", "--seed", "8"]) == 0
+    assert improved == [{"seconds": None, "seed": 0}] * 2 + [{"seconds": 1.5, "seed": 8}]
+    assert solver.calls == []
+    for line in capsys.readouterr().out.splitlines():
+        found = json.loads(line)
+        assert found["method"] == "reference"
+        assert found["tours"] == [[0, 1, 2, 3, 4, 5, 6, 0], [0, 0]]
+        assert found["seconds"] > 0
 
 
 def test_agents_of_a_json_file_are_its_own_unless_given(folder, solver, capsys) -> None:
@@ -194,6 +220,17 @@ def test_it_says_where_the_files_are(folder, solver, capsys) -> None:
         ("square.json --agents 2.5", "got '2.5'"),
         ("square.json --decode sample --samples -3", "--samples: must be a whole number of at least 1, got '-3'"),
         ("square.json --samples 3", "--samples needs --decode sample"),
+        ("square.json --method lkh", "invalid choice: 'lkh'"),
+        ("square.json --improve 0", "--improve: must be a finite number of seconds above 0, got '0'"),
+        ("square.json --improve inf", "must be a finite number of seconds above 0, got 'inf'"),
+        ("square.json --improve soon", "must be a finite number of seconds above 0, got 'soon'"),
+        ("square.json --seconds 1", "--seconds needs --method reference"),
+        ("square.json --method reference --seconds -1", "--seconds: must be a finite number of seconds above 0"),
+        ("square.json --method reference --improve 1", "--improve needs --method dan"),
+        ("square.json --method reference --policy default", "--policy needs --method dan"),
+        ("square.json --method reference --decode greedy", "--decode needs --method dan"),
+        ("square.json --method reference --samples 64", "--samples needs --method dan"),
+        ("square.json --method reference --device cpu", "--device needs --method dan"),
         ("square.json --seed -1", "--seed: must be a whole number of at least 0, got '-1'"),
         ("square.json --seed 9223372036854775808", "--seed: must be"),
         ("square.json --decode beam", "invalid choice: 'beam'"),
@@ -307,33 +344,47 @@ def test_no_command_or_an_unknown_one(capsys) -> None:
     assert "invalid choice: 'sovle'" in refused(capsys, "sovle")
 
 
-def run(*argv: str, **options) -> subprocess.CompletedProcess:
-    """``python -m dan_policy.cli`` as a process of its own."""
-    root = Path(__file__).parent.parent
-    environment = {**os.environ, "PYTHONPATH": str(root)}
-    command = [sys.executable, "-m", "dan_policy.cli", *argv]
-    return subprocess.run(command, env=environment, text=True, check=False, **options)
-
-
-def test_only_solving_imports_torch(tmp_path) -> None:
-    """An import of anything heavy would fail here, as these modules are made impossible to import."""
+def run(*argv: str, missing: Sequence[str] = (), **options) -> subprocess.CompletedProcess:
+    """The command as a process of its own, in which importing the ``missing`` modules fails."""
     code = (
         "import sys\n"
-        "for heavy in ('torch', 'tensordict', 'torchrl', 'matplotlib', 'numba', 'rich', 'vrplib'):\n"
-        "    sys.modules[heavy] = None\n"
+        f"sys.modules.update(dict.fromkeys({tuple(missing)}))\n"
         "from dan_policy.cli import main\n"
         "sys.exit(main(sys.argv[1:]))\n"
     )
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent)}
-    start = [sys.executable, "-c", code]
-    options = {"env": environment, "text": True, "capture_output": True, "check": False}
-    made = subprocess.run([*start, "generate", "--nodes", "5", "--agents", "2", str(tmp_path / "a.json")], **options)
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
+    return subprocess.run([sys.executable, "-c", code, *argv], env=environment, text=True, check=False, **options)
+
+
+TORCH = ("torch", "tensordict", "torchrl")
+
+
+def test_only_solving_imports_what_is_heavy(tmp_path) -> None:
+    missing, file = (*TORCH, "matplotlib", "numba", "rich", "vrplib"), str(tmp_path / "a.json")
+    made = run("generate", "--nodes", "5", "--agents", "2", file, missing=missing)
     assert (made.returncode, made.stderr) == (0, "")
-    solved = subprocess.run([*start, "solve", str(tmp_path / "a.json")], **options)
+    solved = run("solve", file, missing=missing)
     assert solved.returncode == 2
     assert solved.stderr.startswith("mtsp: error: ")
     assert solved.stderr.count("\n") == 1
     assert 'pip install "mtsp-env[dan]"' in solved.stderr
+
+
+def test_the_reference_alone_needs_no_torch(folder, square: Instance) -> None:
+    pytest.importorskip("numba", reason="needs the extra reference")
+    argv = ("solve", "square.json", "--method", "reference", "--seed", "3")
+    done = run(*argv, "--json", missing=(*TORCH, "rich"))
+    assert (done.returncode, done.stderr) == (0, "")
+    found = json.loads(done.stdout)
+    check_tours(square, found["tours"])
+    assert (found["makespan"], found["method"]) == (2.0, "reference")
+    without_rich, without_numba = (run(*argv, missing=(*TORCH, name)) for name in ("rich", "numba"))
+    assert (without_rich.returncode, without_numba.returncode) == (2, 2)
+    assert without_rich.stderr.startswith("mtsp: error: the table needs rich")
+    assert "pip install 'mtsp-env[reference]'" in without_numba.stderr
+    assert without_rich.stderr.count("\n") == without_numba.stderr.count("\n") == 1
+    assert without_rich.stdout == without_numba.stdout == ""
 
 
 @pytest.mark.skipif(os.name == "nt", reason="pipes break differently there")
@@ -341,7 +392,7 @@ def test_a_reader_that_has_seen_enough_is_no_error(tmp_path) -> None:
     reader, writer = os.pipe()
     os.close(reader)
     argv = ("generate", "--nodes", "5", "--agents", "2", str(tmp_path / "a.json"))
-    done = run(*argv, stdout=writer, stderr=subprocess.PIPE)
+    done = run(*argv, stdout=writer)
     os.close(writer)
     assert (done.returncode, done.stderr) == (1, "")
 

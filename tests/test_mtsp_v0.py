@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import copy
 import pickle
+import sys
 import warnings
+from importlib.util import find_spec
 from itertools import combinations
 
 import numpy as np
@@ -16,7 +18,8 @@ from pettingzoo.test.state_test import test_state as check_state
 from pettingzoo.test.state_test import test_state_space as check_state_space
 from pettingzoo.utils import BaseWrapper
 
-from mtsp_env import Instance, check_tours, makespan, mtsp_v0, uniform
+import mtsp_env
+from mtsp_env import Instance, check_tours, lower_bound, makespan, mtsp_v0, uniform
 
 GRID = [
     {"n_nodes": 2, "n_agents": 1, "speed": 0.1, "depot": "open"},
@@ -28,6 +31,8 @@ GRID = [
     {"n_nodes": 30, "n_agents": 12, "speed": 0.01, "depot": "final", "distribution": "clustered"},
     {"n_nodes": 30, "n_agents": 4, "speed": 0.01, "depot": "open", "max_decisions": 9},
 ]
+if find_spec("numba"):  # the extra reference
+    GRID.append({"n_nodes": 7, "n_agents": 3, "speed": 0.1, "depot": "open", "reference": True})
 on_grid = pytest.mark.parametrize(
     "settings", GRID, ids=lambda s: "-".join(map(str, (s["n_nodes"], s["n_agents"], s["speed"], s["depot"])))
 )
@@ -141,6 +146,7 @@ def test_pickles_and_copies_play_the_same(settings: dict) -> None:
         for twin in twins:
             twin.reset(seed=3)
             assert same(play(twin), story)
+            assert same(twin.infos, env.infos)
 
 
 def test_a_given_instance_is_played() -> None:
@@ -185,6 +191,7 @@ def test_what_is_no_instance_is_refused(instance: object) -> None:
         ({"speed": -1.0}, "speed must be .*, got -1.0"),
         ({"depot": "shut"}, "unknown depot rule 'shut'"),
         ({"distribution": "normal"}, "unknown distribution 'normal'; choose from .*'uniform'"),
+        ({"reference": 1000}, "reference must be True or False, got 1000"),
         ({"render_mode": "ansi"}, "unknown render_mode 'ansi'; choose from .*'human'"),
     ],
 )
@@ -290,6 +297,92 @@ def test_nearest_city_in_the_aec_loop(depot: str) -> None:
         env.step(1 + int(np.argmin(cities)))
     assert terminated
     check_tours(env.unwrapped.instance, info["tours"])
+
+
+# Regret
+
+
+@pytest.fixture
+def searches(monkeypatch: pytest.MonkeyPatch) -> list[Instance]:
+    """The instances that the reference solver was asked for."""
+    reference, asked = pytest.importorskip("mtsp_env.reference", reason="needs the extra reference"), []
+    improve = reference.improve
+    monkeypatch.setattr(reference, "improve", lambda instance: asked.append(instance) or improve(instance))
+    mtsp_v0._reference_makespan.cache_clear()
+    return asked
+
+
+@pytest.mark.parametrize("depot", ["open", "final"])
+@pytest.mark.parametrize("max_decisions", [None, 4])
+def test_regret_is_what_the_reference_would_have_saved(searches: list, depot: str, max_decisions: int | None) -> None:
+    env = mtsp_v0.env(n_nodes=8, n_agents=2, depot=depot, max_decisions=max_decisions, reference=True)
+    for seed in range(3):
+        env.reset(seed=seed)
+        rewards = play(env)[-1][3]
+        instance = env.unwrapped.instance
+        for agent in env.agents:
+            info = env.infos[agent]
+            assert lower_bound(instance) <= info["reference_makespan"] <= info["makespan"] + 1e-9
+            assert info["regret"] == pytest.approx(-rewards[agent] / info["reference_makespan"] - 1.0)
+            assert info["regret"] >= -1e-9
+
+
+@pytest.mark.parametrize("depot", ["open", "final"])
+def test_who_goes_as_the_reference_has_no_regret(searches: list, depot: str) -> None:
+    from mtsp_env.reference import improve
+
+    instance = uniform(np.random.default_rng(1), 12, 3)
+    plans = {f"agent_{i}": iter(tour[1:]) for i, tour in enumerate(improve(instance))}
+    env = mtsp_v0.env(n_nodes=12, n_agents=3, depot=depot, reference=True)
+    env.reset(options={"instance": instance})
+    while not over(env):
+        env.step(next(plans[env.agent_selection], 0))
+    assert [info["regret"] for info in env.infos.values()] == pytest.approx([0.0] * 3)
+
+
+def test_the_reference_is_found_at_the_end_once_for_each_instance(searches: list) -> None:
+    env, given = mtsp_v0.env(n_nodes=6, n_agents=2, reference=True), uniform(np.random.default_rng(2), 6, 2)
+    env.reset(seed=0)
+    env.step(random_action(env, np.random.default_rng(0)))
+    env.reset(options={"instance": given})
+    assert searches == [] and env.infos == {"agent_0": {}, "agent_1": {}}
+    play(env)
+    found = [info["reference_makespan"] for info in env.infos.values()]
+    other = mtsp_v0.env(n_nodes=6, n_agents=2, reference=True)
+    other.reset(options={"instance": given})
+    play(other, seed=1)
+    assert searches == [given]
+    assert [info["reference_makespan"] for info in other.infos.values()] == found
+    env.reset(seed=0)
+    play(env)
+    assert len(searches) == 2
+
+
+def test_without_asking_there_is_no_regret(searches: list) -> None:
+    env = mtsp_v0.env(n_nodes=6, n_agents=2)
+    env.reset(seed=0)
+    play(env)
+    assert searches == []
+    assert [set(info) for info in env.infos.values()] == [{"makespan", "tours"}] * 2
+
+
+def test_nobody_regrets_a_tour_of_no_length(searches: list) -> None:
+    env = mtsp_v0.env(n_nodes=4, n_agents=2, reference=True)
+    env.reset(options={"instance": Instance([[0.5, 0.5]] * 4, 2)})
+    play(env)
+    assert [(info["reference_makespan"], info["regret"]) for info in env.infos.values()] == [(0.0, 0.0)] * 2
+
+
+def test_regret_without_numba_names_the_extra_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("reference", "_sisr"):
+        monkeypatch.delattr(mtsp_env, name, raising=False)
+        monkeypatch.delitem(sys.modules, f"mtsp_env.{name}", raising=False)
+    monkeypatch.setitem(sys.modules, "numba", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'mtsp-env\[reference\]'"):
+        mtsp_v0.env(reference=True)
+
+
+# As a TorchRL environment
 
 
 @pytest.mark.parametrize(("depot", "reward"), [("open", "sparse"), ("final", "shaped")])

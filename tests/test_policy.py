@@ -1,5 +1,7 @@
 """Actors, episodes and plans: any network plugs in, whole episodes come out, tours always solve the instance."""
 
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import ExplorationType, set_exploration_type
 
+import mtsp_env
 from benchmarks.policies.nearest import nearest
 from dan_policy import DAN, DANConfig, make_actor, rollout, solution, solve
 from mtsp_env import Instance, check_tours, makespan, mtsp_v0, uniform
@@ -139,6 +142,61 @@ def test_nearest_goes_to_the_nearest_in_both_faces():
     episode = rollout(make_actor(nearest), batched, "greedy", torch.as_tensor(instance.nodes.copy())[None])
     assert batched.tours(episode.last)[0] == info["tours"]
     check_tours(instance, info["tours"])
+
+
+# Improvement
+
+
+@pytest.mark.parametrize(
+    ("decode", "name"), [("greedy", "dan(g.)+improve(0.05 s)"), ("sample", "dan(s.3)+improve(0.05 s)")]
+)
+def test_improved_plans_are_shorter_and_take_their_time(network, decode, name):
+    pytest.importorskip("numba", reason="needs the extra reference")
+    instance = uniform(np.random.default_rng(5), 40, 1)  # one agent: no search ends early at the farthest city
+    for policy in (network, make_actor(nearest)):
+        plain = solve(instance, policy, decode, samples=3)
+        improved = solve(instance, policy, decode, samples=3, improve=0.05)
+        check_tours(instance, improved.tours)
+        assert improved.makespan == makespan(instance.nodes, improved.tours) < plain.makespan
+        assert improved.method == name
+        assert improved.seconds >= 0.05
+
+
+def test_the_policys_tours_are_what_is_improved(network, monkeypatch):
+    reference = pytest.importorskip("mtsp_env.reference", reason="needs the extra reference")
+    instance, calls = uniform(np.random.default_rng(6), 12, 3), []
+    monkeypatch.setattr(reference, "improve", lambda *args, **options: calls.append((args, options)) or args[1])
+    plain, improved = (solve(instance, network, "sample", 4, seed=9, improve=seconds) for seconds in (None, 2.5))
+    assert calls == [((instance, plain.tours), {"seconds": 2.5, "seed": 9})]
+    assert improved.tours == plain.tours
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"improve": 0.0}, "improve must be a finite number above 0, got 0.0"),
+        ({"improve": -1}, "improve must be a finite number above 0, got -1"),
+        ({"improve": float("inf")}, "improve must be a finite number above 0, got inf"),
+        ({"improve": True}, "improve must be a finite number above 0, got True"),
+        ({"improve": "soon"}, "improve must be a finite number above 0, got 'soon'"),
+        ({"improve": 1.0, "seed": -1}, "seed must be a whole number of at least 0, got -1"),
+    ],
+)
+def test_what_cannot_be_improved_is_not_planned(network, monkeypatch, kwargs, message):
+    pytest.importorskip("numba", reason="needs the extra reference")
+    monkeypatch.setattr(solution, "rollout", None)  # calling it would be a TypeError
+    with pytest.raises(ValueError, match=message):
+        solve(uniform(np.random.default_rng(0), 5, 2), network, **kwargs)
+
+
+def test_improvement_without_numba_names_the_extra_before_it_plans(network, monkeypatch):
+    for name in ("reference", "_sisr"):
+        monkeypatch.delattr(mtsp_env, name, raising=False)
+        monkeypatch.delitem(sys.modules, f"mtsp_env.{name}", raising=False)
+    monkeypatch.setitem(sys.modules, "numba", None)
+    monkeypatch.setattr(solution, "rollout", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'mtsp-env\[reference\]'"):
+        solve(uniform(np.random.default_rng(0), 5, 2), network, improve=1.0)
 
 
 @pytest.mark.parametrize(

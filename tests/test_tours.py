@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mtsp_env import Instance, check_tours, lower_bound, makespan, tour_lengths
+from mtsp_env.tours import farthest_trip
 
 
 def shortest_tours(nodes: np.ndarray) -> dict[frozenset[int], float]:
@@ -54,6 +55,7 @@ def test_lengths_by_hand() -> None:
     assert makespan(nodes, []) == 0.0
 
 
+@settings(deadline=None)
 @given(small, st.randoms(use_true_random=False))
 def test_a_tour_is_as_long_backwards(instance: Instance, random) -> None:
     order = list(range(1, instance.n_nodes))
@@ -76,6 +78,7 @@ def solved(draw) -> tuple[Instance, list[list[int]]]:
     return instance, [[*tour, 0] for tour in tours]
 
 
+@settings(deadline=None)
 @given(solved())
 def test_valid_tours_pass_and_no_bound_is_above_them(case: tuple) -> None:
     instance, tours = case
@@ -84,6 +87,7 @@ def test_valid_tours_pass_and_no_bound_is_above_them(case: tuple) -> None:
     assert lower_bound(instance) <= makespan(instance.nodes, tours) + 1e-12
 
 
+@settings(deadline=None)
 @given(solved(), st.data())
 def test_a_lost_and_a_repeated_city_are_named(case: tuple, data) -> None:
     instance, tours = case
@@ -155,6 +159,23 @@ def test_the_bound_is_the_optimum_where_the_farthest_city_decides(nodes: list, n
     assert optimum(instance) == pytest.approx(best, abs=1e-12)
 
 
+def test_the_farthest_trip(square: Instance) -> None:
+    assert farthest_trip(square.nodes) == math.sqrt(2.0)
+    assert farthest_trip([[3, 4], [0, 0], [3, 5]]) == 10.0
+
+
+@settings(deadline=None)
+@given(small)
+def test_with_an_agent_for_each_city_the_farthest_trip_is_the_optimum(instance: Instance) -> None:
+    many = Instance(instance.nodes, max(instance.n_nodes - 1, instance.n_agents))
+    tours = [[0, city, 0] for city in range(1, many.n_nodes)]
+    tours += [[0, 0]] * (many.n_agents - len(tours))
+    check_tours(many, tours)
+    assert makespan(many.nodes, tours) == pytest.approx(farthest_trip(instance.nodes), abs=1e-12)
+    assert farthest_trip(instance.nodes) <= lower_bound(instance)
+
+
+@settings(deadline=None)
 @given(small, st.floats(0.01, 1.0))
 def test_the_bound_grows_with_the_map(instance: Instance, factor: float) -> None:
     smaller = Instance(instance.nodes * factor, instance.n_agents)
