@@ -1,5 +1,6 @@
 """REINFORCE with a rollout baseline: the gradient is the formula, chunks add up, runs resume bit by bit and learn."""
 
+import itertools
 import signal
 from dataclasses import replace
 
@@ -13,8 +14,8 @@ from torchrl.objectives import ReinforceLoss
 from dan_policy import DANConfig, make_actor
 from train import checkpoint
 from train.__main__ import main
-from train.baseline import RolloutBaseline, better
-from train.collect import Instances, costs, draw, draw_set, play
+from train.baseline import RolloutBaseline, SharedBaseline, better
+from train.collect import Instances, costs, draw, draw_set, play, repeat
 from train.config import PAPER, QUICK, ReinforceConfig, check_same_run
 from train.loss import EpisodicReinforceLoss, backward, decisions_with_advantage, log_probs
 from train.reinforce import Trainer, reinforce
@@ -158,12 +159,60 @@ def test_the_baseline_changes_only_when_beaten_and_then_draws_a_new_test_set(mon
     config = replace(TINY, n_nodes=(8, 8), n_agents=(3, 3), challenge_instances=64)
     baseline = RolloutBaseline(bad, config, rng)
     instances = draw(rng, config, 10)
-    assert torch.equal(baseline.value(instances), play(bad, instances, config, "greedy").reward)
+    zeros = torch.zeros(10)
+    assert torch.equal(baseline.value(instances, zeros), play(bad, instances, config, "greedy").reward)
     first_set = baseline.test_set[0].nodes
     assert baseline.challenge(good) and not torch.equal(baseline.test_set[0].nodes, first_set)
-    assert torch.equal(baseline.value(instances), play(good, instances, config, "greedy").reward)
+    assert torch.equal(baseline.value(instances, zeros), play(good, instances, config, "greedy").reward)
     second_set = baseline.test_set[0].nodes
     assert not baseline.challenge(bad) and torch.equal(baseline.test_set[0].nodes, second_set)
+
+
+def test_the_shared_baseline_leaves_each_episode_out():
+    reward = torch.tensor([1.0, 2.0, 6.0, -1.0, -2.0, -3.0])
+    value = SharedBaseline(3).value(None, reward)
+    assert value.tolist() == [4.0, 3.5, 1.5, -2.5, -2.0, -1.5]
+
+
+def test_the_shared_baseline_is_unbiased_where_including_oneself_would_not_be():
+    """One decision among two, rewards 0 and 1, p = sigmoid(t): the exact gradient of E[R] is p (1 - p). Every outcome
+    of three samples is weighed with its probability."""
+    p = 0.3
+    with_others = with_itself = 0.0
+    for chosen in itertools.product((0, 1), repeat=3):
+        probability = np.prod([p if c else 1 - p for c in chosen])
+        reward = torch.tensor(chosen, dtype=torch.float64)
+        score = reward - p  # d log p(choice) / dt
+        advantage = reward - SharedBaseline(3).value(None, reward)
+        with_others += probability * float((advantage * score).mean())
+        with_itself += probability * float(((reward - reward.mean()) * score).mean())
+    assert with_others == pytest.approx(p * (1 - p), abs=1e-12)
+    assert with_itself == pytest.approx(2 / 3 * p * (1 - p), abs=1e-12)
+
+
+def test_repeated_instances_are_the_same_seen_from_eight_sides():
+    nodes = torch.rand(2, 6, 2, dtype=torch.float64)
+    repeated = repeat(Instances(nodes, 2), 9).nodes
+    assert torch.equal(repeated[::9], nodes) and torch.equal(repeated[8::9], nodes)
+    assert ((repeated >= 0) & (repeated <= 1)).all()
+    lengths = torch.cdist(repeated, repeated)
+    torch.testing.assert_close(lengths, torch.cdist(nodes, nodes).repeat_interleave(9, 0))
+    assert len({tuple(row.flatten().tolist()) for row in repeated[:8]}) == 8
+
+
+def test_shared_training_goes_through_the_same_step():
+    config = replace(TINY, baseline="shared", samples=4, batch_size=5, normalise=True, batch_tokens=21)
+    trainer = Trainer(config)
+    assert isinstance(trainer.baseline, SharedBaseline)
+    logs = trainer.train_step()
+    assert 21 // 8 <= trainer.instances <= 21 // 5 and np.isfinite(logs["grad_norm"])
+
+
+def test_a_curriculum_changes_the_ranges_at_its_steps():
+    config = replace(TINY, curriculum=((2, 20, 30, 4, 5), (5, 40, 50, 6, 7)))
+    assert config.at(1).n_nodes == (5, 8) and config.at(1).n_agents == (1, 3)
+    assert config.at(2).n_nodes == (20, 30) and config.at(4).n_agents == (4, 5)
+    assert config.at(5).n_nodes == (40, 50) and config.at(99).n_agents == (6, 7)
 
 
 def test_drawn_sizes_cover_their_ranges():
@@ -264,6 +313,9 @@ def test_training_lowers_the_greedy_cost_on_held_out_instances(tmp_path):
         ({"learning_rate": 0.0}, "learning_rate must be above 0"),
         ({"challenge_p": 1.0}, "challenge_p must lie between 0 and 1"),
         ({"distribution": "normal"}, "unknown distribution 'normal'"),
+        ({"baseline": "shared"}, "samples must be a whole number of at least 2, got 1"),
+        ({"curriculum": ((0, 9, 8, 1, 2),)}, r"n_nodes\[1\] must be a whole number of at least 9, got 8"),
+        ({"nodes_per_agent": 5}, r"nodes_per_agent must be at most n_nodes\[0\] // n_agents\[0\] = 4, got 5"),
     ],
 )
 def test_bad_configurations_are_named(kwargs, message):

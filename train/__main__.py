@@ -1,4 +1,4 @@
-"""``python -m train reinforce {paper,quick} [options]``."""
+"""``python -m train imitate [options]``, ``python -m train reinforce {paper,quick} [options]``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import Annotated
 
 import tyro
 
-from train.config import PRESETS
+from train.config import PRESETS, ImitateConfig
+from train.imitate import imitate
 from train.reinforce import reinforce
 
 Preset = tyro.extras.subcommand_type_from_defaults(
@@ -21,6 +22,12 @@ app = tyro.extras.SubcommandApp()
 def reinforce_command(config: Annotated[Preset, tyro.conf.arg(name="")]) -> None:
     """Train a DAN by REINFORCE with a greedy rollout baseline, from a preset with any option changed."""
     reinforce(config)
+
+
+@app.command(name="imitate")
+def imitate_command(config: Annotated[ImitateConfig, tyro.conf.arg(name="")]) -> None:
+    """Train a DAN to choose as the reference solver does: a warm start for `reinforce`."""
+    imitate(config)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -1,9 +1,9 @@
-"""The greedy rollout baseline (Kool et al. 2019; paper, Sec. 5.1)."""
+"""Baselines, b in the advantage R - b: the best policy so far, or the other samples of the same instance."""
 
 from __future__ import annotations
 
 import copy
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.stats import ttest_rel
@@ -11,19 +11,59 @@ from torch import Tensor, nn
 
 from train.collect import Instances, costs, draw_set, play
 from train.config import ReinforceConfig
+from train.distributed import gather
+
+
+class Baseline(Protocol):
+    """What a trainer asks of one."""
+
+    def value(self, instances: Instances, reward: Tensor) -> Tensor:
+        """(B,) What each episode's reward (B,) is compared with. Must not depend on that episode's actions."""
+
+    def challenge(self, network: nn.Module) -> bool:
+        """Offer it a better policy; whether it took that."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything but the random generator, which belongs to the trainer."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what ``state_dict`` returned."""
+
+
+class SharedBaseline:
+    """The mean reward of the other samples of the same instance (Kool et al. 2019b; Kwon et al. 2020).
+
+    Episodes i * K to i * K + K - 1 are the samples of one instance. Leaving out its own keeps the gradient unbiased.
+    """
+
+    def __init__(self, samples: int):
+        self.samples = samples
+
+    def value(self, instances: Instances, reward: Tensor) -> Tensor:
+        """(B,) The mean of the K - 1 others."""
+        rewards = reward.view(-1, self.samples)
+        return ((rewards.sum(1, keepdim=True) - rewards) / (self.samples - 1)).flatten()
+
+    def challenge(self, network: nn.Module) -> bool:
+        """There is no policy to replace."""
+        return False
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Nothing."""
 
 
 class RolloutBaseline:
-    """The best policy so far, played greedily on the same instances: b in the advantage R - b.
-
-    Any object with ``value(instances)`` and ``challenge(network)`` can take its place.
-    """
+    """The best policy so far, played greedily on the same instances (Kool et al. 2019a; paper, Sec. 5.1)."""
 
     def __init__(self, network: nn.Module, config: ReinforceConfig, rng: np.random.Generator):
         self.config, self.rng = config, rng
         self._crown(network)
 
-    def value(self, instances: Instances) -> Tensor:
+    def value(self, instances: Instances, reward: Tensor) -> Tensor:
         """(B,) The reward that the best policy so far gets on each instance."""
         return play(self.network, instances, self.config, "greedy").reward
 
@@ -33,7 +73,7 @@ class RolloutBaseline:
         The test set is drawn afresh whenever the baseline changes, so that it is never overfitted.
         """
         cost = costs(network, self.test_set, self.config)
-        won = better(cost, self.test_costs, self.config.challenge_p)
+        won = better(gather(cost), gather(self.test_costs), self.config.challenge_p)
         if won:
             self._crown(network)
         return won

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from dan_policy.actor import OBSERVATION, make_actor
 from dan_policy.episode import Decode, Episode, rollout
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.instance import sample_nodes
-from train.config import ReinforceConfig
+from train.config import RunConfig
 
 
 class Instances(NamedTuple):
@@ -26,37 +23,62 @@ class Instances(NamedTuple):
     n_agents: int
 
 
-def draw(rng: np.random.Generator, config: ReinforceConfig, batch: int) -> Instances:
-    """``batch`` fresh instances; n and m are drawn once for all of them."""
+def draw_size(rng: np.random.Generator, config: RunConfig) -> tuple[int, int]:
+    """n and m, uniform in their ranges."""
     n_nodes = int(rng.integers(*config.n_nodes, endpoint=True))
-    n_agents = int(rng.integers(*config.n_agents, endpoint=True))
+    most = max(config.n_agents[0], min(config.n_agents[1], n_nodes // config.nodes_per_agent))
+    return n_nodes, int(rng.integers(config.n_agents[0], most, endpoint=True))
+
+
+def draw(rng: np.random.Generator, config: RunConfig, batch: int, tokens: int | None = None) -> Instances:
+    """``batch`` fresh instances, fewer where they would hold more than ``tokens`` nodes; one n and m for all."""
+    n_nodes, n_agents = draw_size(rng, config)
+    batch = batch if tokens is None else max(1, min(batch, tokens // n_nodes))
     nodes = sample_nodes(config.distribution, rng, batch, n_nodes)
     return Instances(torch.as_tensor(nodes, device=config.device), n_agents)
 
 
-def draw_set(rng: np.random.Generator, config: ReinforceConfig, count: int, sizes: int = 8) -> list[Instances]:
+def repeat(instances: Instances, samples: int) -> Instances:
+    """Each instance ``samples`` times in a row, in another of the square's eight symmetries each time."""
+    if samples == 1:
+        return instances
+    nodes = torch.stack([symmetry(instances.nodes, k % 8) for k in range(samples)], dim=1)  # (B, samples, n, 2)
+    return Instances(nodes.flatten(0, 1), instances.n_agents)
+
+
+def symmetry(nodes: Tensor, k: int) -> Tensor:
+    """The ``k``-th of the eight rotations and reflections of the unit square, of nodes (..., 2); 0 changes nothing."""
+    x, y = nodes.unbind(-1)
+    x, y = (1 - x if k & 1 else x), (1 - y if k & 2 else y)
+    return torch.stack([y, x] if k & 4 else [x, y], dim=-1)
+
+
+def draw_set(rng: np.random.Generator, config: RunConfig, count: int, sizes: int = 8) -> list[Instances]:
     """``count`` instances in about ``sizes`` batches, each of its own n and m: a set to compare policies on."""
     counts = [len(part) for part in np.array_split(np.arange(count), min(sizes, count))]
     return [draw(rng, config, part) for part in counts]
 
 
-def play(
-    network: nn.Module, instances: Instances, config: ReinforceConfig, decode: Decode, keep: bool = False
-) -> Episode:
+def play(network: nn.Module, instances: Instances, config: RunConfig, decode: Decode, keep: bool = False) -> Episode:
     """Whole, on-policy episodes of ``network``, one per instance; ``keep`` the decisions, to learn from them.
 
     The one place where training meets the environment: in one process, with ``rollout``.
     """
     batch, n_nodes = instances.nodes.shape[:2]
-    env = _environment(n_nodes, instances.n_agents, batch, config.speed, config.depot, config.device)
+    env = environment(n_nodes, instances.n_agents, batch, config)
     with autocast(config):
         kept = (*OBSERVATION, "action_mask") if keep else ()
         return rollout(make_actor(network), env, decode, instances.nodes, kept)
 
 
-def costs(network: nn.Module, instances: list[Instances], config: ReinforceConfig) -> Tensor:
+def costs(network: nn.Module, instances: list[Instances], config: RunConfig) -> Tensor:
     """(sum of B,) Greedy cost of every instance."""
     return torch.cat([-play(network, part, config, "greedy").reward for part in instances])
+
+
+def environment(n_nodes: int, n_agents: int, batch: int, config: RunConfig) -> BatchedMTSP:
+    """The run's environment for a batch of one size; they are kept, because building their specs takes milliseconds."""
+    return _environment(n_nodes, n_agents, batch, config.speed, config.depot, config.device)
 
 
 @lru_cache(maxsize=1024)
@@ -64,11 +86,6 @@ def _environment(n_nodes: int, n_agents: int, batch: int, speed: float, depot: s
     return BatchedMTSP(n_nodes, n_agents, [batch], speed, depot, device=device, check_actions=False)
 
 
-@contextmanager
-def autocast(config: ReinforceConfig) -> Iterator[None]:
-    """The run's precision. On a CPU bfloat16 takes the plain attention: the fused kernel is slow backwards there."""
-    kind = torch.device(config.device).type
-    lower = config.precision == "bfloat16"
-    kernel = sdpa_kernel(SDPBackend.MATH) if lower and kind == "cpu" else nullcontext()
-    with torch.autocast(kind, torch.bfloat16, enabled=lower), kernel:
-        yield
+def autocast(config: RunConfig) -> torch.autocast:
+    """The run's precision, as a context."""
+    return torch.autocast(torch.device(config.device).type, torch.bfloat16, enabled=config.precision == "bfloat16")

@@ -11,18 +11,28 @@ from dan_policy.network import DANConfig
 from mtsp_env.instance import check_count, check_distribution
 
 # May differ between a run and its continuation; everything else is part of what is being trained.
-FREE_ON_RESUME = ("out", "resume", "steps", "seconds", "threads", "tensorboard", "checkpoint_every", "device")
+FREE_ON_RESUME = (
+    "out",
+    "resume",
+    "steps",
+    "seconds",
+    "threads",
+    "tensorboard",
+    "checkpoint_every",
+    "device",
+    "workers",
+)
 
 
-@dataclass(frozen=True)
-class ReinforceConfig:
-    """REINFORCE with a greedy rollout baseline (paper, Sec. 5.1).
+@dataclass(frozen=True, kw_only=True)
+class RunConfig:
+    """What every kind of training has: where it writes, what it trains, on which instances, when it validates.
 
     Raises:
         ValueError: a value outside its range.
     """
 
-    out: Path = Path("runs/reinforce")
+    out: Path = Path("runs/train")
     """Folder for checkpoint, weights and logs."""
     resume: bool = False
     """Go on from the checkpoint in `out`, bit by bit as if the run had never stopped."""
@@ -36,38 +46,24 @@ class ReinforceConfig:
     """Range of n, the depot included; drawn once per batch."""
     n_agents: tuple[int, int] = (5, 10)
     """Range of m; drawn once per batch."""
+    nodes_per_agent: int = 1
+    """At least so many nodes for each agent: the upper end of m's range falls with n."""
     distribution: str = "uniform"
     speed: float = 0.1
     """Distance per tick, the paper's Delta g."""
     depot: Literal["open", "final"] = "open"
     """Whether an agent that is back at the depot may leave again."""
-    batch_size: int = 8
-    """Instances per optimiser step."""
 
     network: DANConfig = field(default_factory=DANConfig.paper)
     init: str | None = None
     """Weights to start from: a file, or the name of a shipped model (its configuration replaces `network`)."""
-
-    learning_rate: float = 1e-5
-    decay: float = 0.96
-    """Factor on the learning rate every `decay_every` steps."""
-    decay_every: int = 1024
     max_grad_norm: float = 1.0
-
-    challenge_every: int = 128
-    """Steps between challenges of the baseline."""
-    challenge_instances: int = 512
-    """Fresh instances that the baseline is tested on."""
-    challenge_p: float = 0.05
-    """One-sided paired t-test: the policy replaces the baseline below this p."""
 
     validation_instances: int = 256
     """Held-out instances (the same in every run) for the reported cost and for `best.safetensors`."""
     validate_every: int = 128
     checkpoint_every: int = 128
 
-    chunk: int = 512
-    """Decisions whose log-probabilities are recomputed at once: the bound on memory."""
     precision: Literal["float32", "bfloat16"] = "float32"
     """bfloat16 autocast pays on GPUs and on CPUs with AMX."""
     device: str = "cpu"
@@ -81,31 +77,166 @@ class ReinforceConfig:
             low, high = getattr(self, name)
             check_count(f"{name}[0]", low, minimum)
             check_count(f"{name}[1]", high, low)
-        for name in (
-            "steps",
-            "batch_size",
-            "chunk",
-            "decay_every",
-            "challenge_every",
-            "validate_every",
-            "checkpoint_every",
-        ):
-            check_count(name, getattr(self, name), 1)
-        for name in ("challenge_instances", "validation_instances"):
-            check_count(name, getattr(self, name), 2)
-        for name in ("learning_rate", "decay", "max_grad_norm", "speed"):
+        self._check_at_least(1, "steps", "nodes_per_agent", "validate_every", "checkpoint_every")
+        self._check_at_least(2, "validation_instances")
+        self._check_positive("max_grad_norm", "speed")
+        if self.n_agents[0] * self.nodes_per_agent > self.n_nodes[0]:
+            raise ValueError(
+                f"nodes_per_agent must be at most n_nodes[0] // n_agents[0] = {self.n_nodes[0] // self.n_agents[0]}, "
+                f"got {self.nodes_per_agent}"
+            )
+        check_distribution(self.distribution)
+
+    def _check_at_least(self, minimum: int, *names: str) -> None:
+        for name in names:
+            check_count(name, getattr(self, name), minimum)
+
+    def _check_positive(self, *names: str) -> None:
+        for name in names:
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be above 0, got {getattr(self, name)!r}")
-        if not 0 < self.challenge_p < 1:
-            raise ValueError(f"challenge_p must lie between 0 and 1, got {self.challenge_p!r}")
-        check_distribution(self.distribution)
 
     def to_dict(self) -> dict:
         """The configuration as JSON values."""
         return json.loads(json.dumps(asdict(self), default=str))
 
 
-def check_same_run(old: dict, config: ReinforceConfig) -> None:
+@dataclass(frozen=True, kw_only=True)
+class ReinforceConfig(RunConfig):
+    """REINFORCE with a greedy rollout baseline (paper, Sec. 5.1).
+
+    Raises:
+        ValueError: a value outside its range.
+    """
+
+    out: Path = Path("runs/reinforce")
+    """Folder for checkpoint, weights and logs."""
+    batch_size: int = 8
+    """Instances per optimiser step, for each process."""
+    batch_tokens: int | None = None
+    """Instances times nodes per optimiser step, at most: larger instances come in smaller batches. None: no bound."""
+    curriculum: tuple[tuple[int, int, int, int, int], ...] = ()
+    """Later ranges: from step, least n, greatest n, least m, greatest m. Five numbers for each stage."""
+
+    baseline: Literal["rollout", "shared"] = "rollout"
+    """rollout: the best policy so far, greedily (the paper). shared: the other samples of the same instance."""
+    samples: int = 1
+    """Episodes of each instance; for `shared` at least 2, each seen in another rotation or reflection."""
+    normalise: bool = False
+    """Divide advantages by their standard deviation over the batch."""
+
+    learning_rate: float = 1e-5
+    decay: float = 0.96
+    """Factor on the learning rate every `decay_every` steps."""
+    decay_every: int = 1024
+
+    challenge_every: int = 128
+    """Steps between challenges of the baseline."""
+    challenge_instances: int = 512
+    """Fresh instances that the baseline is tested on."""
+    challenge_p: float = 0.05
+    """One-sided paired t-test: the policy replaces the baseline below this p."""
+
+    chunk: int = 512
+    """Decisions whose log-probabilities are recomputed at once: the bound on memory."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check_at_least(1, "batch_size", "chunk", "decay_every", "challenge_every")
+        self._check_at_least(2, "challenge_instances")
+        self._check_at_least(2 if self.baseline == "shared" else 1, "samples")
+        self._check_positive("learning_rate", "decay")
+        if self.batch_tokens is not None:
+            self._check_at_least(1, "batch_tokens")
+        for first, *ranges in self.curriculum:
+            check_count("curriculum: from step", first, 0)
+            replace(self, curriculum=(), n_nodes=tuple(ranges[:2]), n_agents=tuple(ranges[2:]))
+        if not 0 < self.challenge_p < 1:
+            raise ValueError(f"challenge_p must lie between 0 and 1, got {self.challenge_p!r}")
+
+    def at(self, step: int) -> ReinforceConfig:
+        """The configuration with the ranges that hold at ``step``."""
+        begun = [ranges for first, *ranges in self.curriculum if first <= step]
+        if not begun:
+            return self
+        return replace(self, curriculum=(), n_nodes=tuple(begun[-1][:2]), n_agents=tuple(begun[-1][2:]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImitateConfig(RunConfig):
+    """Imitation of the reference solver: a warm start for REINFORCE, or a policy of its own.
+
+    A *set* is a batch of instances of one (n, m) with the teacher's tours; a *row* is all of a set's decisions at one
+    index, rectangular after pruning. An optimiser step takes `rows` rows of as many sets, chosen at random among
+    `buffer` sets, so that it mixes sizes and phases of the game.
+
+    Raises:
+        ValueError: a value outside its range.
+    """
+
+    out: Path = Path("runs/imitate")
+    """Folder for checkpoint, weights and logs."""
+    steps: int = 20_000
+    """Optimiser steps in all; the learning rate reaches its end with them."""
+    n_nodes: tuple[int, int] = (20, 200)
+    """Range of n, the depot included; drawn once per set."""
+    n_agents: tuple[int, int] = (2, 20)
+    """Range of m; drawn once per set."""
+    nodes_per_agent: int = 5
+    """At least so many nodes for each agent: the upper end of m's range falls with n."""
+    speed: float = 0.01
+    """Distance per tick, the paper's Delta g (in its tests)."""
+    depot: Literal["final"] = "final"
+    """Whether an agent that is back at the depot may leave again: the teacher's never do."""
+    network: DANConfig = field(default_factory=lambda: DANConfig(prune_visited=True))
+
+    set_tokens: int = 6400
+    """Instances times nodes of a set, about: a set has this divided by n instances, between 16 and 256."""
+    buffer: int = 16
+    """Sets that are learnt from at a time."""
+    passes: float = 1.0
+    """Share of a set's decision indices that are learnt from before it gives way to a fresh one, at most 1."""
+    rows: int = 4
+    """Rows per optimiser step."""
+    teacher_iterations: int = 80
+    """Iterations of the reference solver for each node of an instance."""
+    workers: int = 1
+    """Processes that make sets while the network learns; 0: the learning process makes them itself, in between."""
+
+    learning_rate: float = 5e-4
+    """Peak, after a linear warm-up; falls along half a cosine to `final_rate` of it."""
+    final_rate: float = 0.02
+    warmup: int = 200
+    """Steps of the warm-up."""
+    weight_decay: float = 0.01
+    """AdamW's."""
+    average: float = 0.999
+    """Decay of the running average of the weights, which is what is validated and saved."""
+    validate_every: int = 500
+    checkpoint_every: int = 500
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check_at_least(1, "set_tokens", "buffer", "rows", "teacher_iterations", "warmup")
+        self._check_at_least(0, "workers")
+        self._check_positive("learning_rate")
+        if self.depot != "final":
+            raise ValueError(f"depot must be 'final' (the teacher's agents never leave twice), got {self.depot!r}")
+        if self.n_nodes[0] <= self.n_agents[0]:
+            raise ValueError(f"n_nodes[0] must be above n_agents[0]={self.n_agents[0]}, got {self.n_nodes[0]}")
+        if self.rows > self.buffer:
+            raise ValueError(f"rows must be at most buffer={self.buffer}, got {self.rows}")
+        if not 0 < self.passes <= 1:
+            raise ValueError(f"passes must be above 0 and at most 1, got {self.passes!r}")
+        if not 0 < self.final_rate <= 1:
+            raise ValueError(f"final_rate must be above 0 and at most 1, got {self.final_rate!r}")
+        if not 0 <= self.average < 1:
+            raise ValueError(f"average must be at least 0 and below 1, got {self.average!r}")
+        if not self.weight_decay >= 0:
+            raise ValueError(f"weight_decay must be at least 0, got {self.weight_decay!r}")
+
+
+def check_same_run(old: dict, config: RunConfig) -> None:
     """Raise ValueError where ``config`` would change what an interrupted run was training."""
     new = config.to_dict()
     changed = [k for k in new if k not in FREE_ON_RESUME and old.get(k) != new[k]]
@@ -136,7 +267,29 @@ QUICK = replace(
 )
 """Small instances, the depot rule "final" and a larger step: learns within minutes on two CPU cores."""
 
+REFINE = replace(
+    PAPER,
+    steps=1_000,
+    n_nodes=(20, 100),
+    n_agents=(2, 10),
+    nodes_per_agent=5,
+    speed=0.01,
+    depot="final",
+    baseline="shared",
+    samples=8,
+    batch_size=64,
+    batch_tokens=800,
+    normalise=True,
+    network=DANConfig(prune_visited=True),
+    learning_rate=1e-4,
+    decay=1.0,
+    validate_every=50,
+    checkpoint_every=50,
+)
+"""From imitated weights (``init``): many samples of few instances, each other's baseline."""
+
 PRESETS = {
     "paper": ("the paper's setting: n in [20, 100], m in [5, 10], 8 instances a step, Adam 1e-5", PAPER),
+    "refine": ("sharpens imitated weights (--init): 8 samples of each instance, each other's baseline", REFINE),
     "quick": ("n in [10, 30], m in [2, 5], 128 instances a step: learns within minutes on a CPU", QUICK),
 }

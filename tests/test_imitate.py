@@ -1,0 +1,224 @@
+"""Demonstrations are the teacher's tours in one canonical form; learning from them resumes bit by bit and learns."""
+
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dan_policy import DANConfig
+from dan_policy.episode import rollout
+from mtsp_env import check_tours, makespan
+from mtsp_env.instance import Instance
+from train import checkpoint
+from train.__main__ import main
+from train.baseline import better
+from train.collect import Instances, costs, environment, play
+from train.config import ImitateConfig
+from train.demonstrations import as_links, canonical, demonstrate, follow, replay
+from train.imitate import Buffer, Imitator, imitate, rate
+
+pytest.importorskip("numba", reason="the teacher is compiled with Numba")
+
+TINY = ImitateConfig(
+    n_nodes=(6, 9),
+    n_agents=(1, 3),
+    nodes_per_agent=2,
+    network=DANConfig(embed_dim=16, feedforward_dim=32, n_heads=2, city_layers=1, prune_visited=True),
+    set_tokens=100,
+    buffer=3,
+    rows=2,
+    workers=0,
+    teacher_iterations=20,
+    warmup=2,
+    steps=24,
+    average=0.5,
+    validate_every=4,
+    validation_instances=8,
+    checkpoint_every=4,
+    tensorboard=False,
+)
+
+
+@st.composite
+def solved(draw):
+    """An instance and any tours that solve it, idle agents and clockwise tours among them."""
+    n_nodes, seed = draw(st.integers(2, 14)), draw(st.integers(0, 2**32 - 1))
+    n_agents = draw(st.integers(1, n_nodes - 1))
+    rng = np.random.default_rng(seed)
+    tours = [[0] for _ in range(n_agents)]
+    for city in rng.permutation(n_nodes - 1) + 1:
+        tours[rng.integers(n_agents)].append(int(city))
+    return Instance(rng.random((n_nodes, 2)), n_agents), [[*tour, 0] for tour in tours]
+
+
+@given(solved())
+@settings(max_examples=200, deadline=None)
+def test_canonical_tours_solve_the_same_instance_no_worse_in_one_order_whatever_they_came_in(case):
+    instance, tours = case
+    found = canonical(instance.nodes, tours)
+    check_tours(instance, found)
+    assert makespan(instance.nodes, found) <= makespan(instance.nodes, tours) + 1e-12
+    assert all(len(tour) > 2 for tour in found)  # nobody stays at home
+    turned = [tour[::-1] for tour in tours[::-1]]
+    if all(len(tour) > 2 for tour in tours):
+        assert sorted(map(sorted, found)) == sorted(map(sorted, tours))  # the same division of the cities
+        assert [t for t in canonical(instance.nodes, turned) if len(t) > 3] == [t for t in found if len(t) > 3]
+
+
+def test_tours_run_counter_clockwise_and_agents_go_by_angle():
+    """The depot in the middle of a square of eight; west is where angles begin and end."""
+    nodes = np.array([[0.5, 0.5], [1, 0.6], [0.6, 1], [0.4, 1], [0, 0.6], [0, 0.4], [0.4, 0], [0.6, 0], [1, 0.4]])
+    tours = [[0, 2, 1, 0], [0, 4, 3, 0], [0, 8, 7, 0], [0, 6, 5, 0]]  # clockwise
+    south_west, south_east, north_east, north_west = [0, 5, 6, 0], [0, 7, 8, 0], [0, 1, 2, 0], [0, 3, 4, 0]
+    assert canonical(nodes, tours) == [south_west, south_east, north_east, north_west]
+
+
+@given(solved())
+@settings(max_examples=50, deadline=None)
+def test_the_teachers_policy_plays_its_tours(case):
+    instance, tours = case
+    tours = canonical(instance.nodes, tours)
+    first, following = (torch.as_tensor(part)[None].numpy() for part in as_links(tours, instance.n_nodes))
+    shown = type(demonstrate(TINY, 0))(instance.nodes[None], first, following)
+    env = environment(instance.n_nodes, instance.n_agents, 1, TINY)
+    episode = rollout(follow(shown), env, "greedy", torch.tensor(shown.nodes))
+    assert env.tours() == [tours]
+    assert -float(episode.reward) == pytest.approx(makespan(instance.nodes, tours))
+
+
+def test_a_replayed_set_holds_every_decision_of_the_teachers_tours():
+    shown = demonstrate(TINY, 3)
+    decisions, valid = replay(shown, TINY)
+    batch, n_nodes = shown.nodes.shape[:2]
+    assert decisions.shape == valid.shape and valid.shape[1] == batch
+    for b in range(batch):
+        chosen = decisions["action"][:, b][valid[:, b]]
+        assert sorted(chosen[chosen != 0].tolist()) == list(range(1, n_nodes))
+    assert decisions["action_mask"].gather(2, decisions["action"][..., None])[..., 0][valid].all()
+
+
+def test_sets_depend_on_their_index_alone_and_the_teacher_is_near_optimal():
+    one, again, other = demonstrate(TINY, 5), demonstrate(TINY, 5), demonstrate(TINY, 6)
+    assert all(np.array_equal(a, b) for a, b in zip(one, again, strict=True))
+    assert one.nodes.shape != other.nodes.shape or not np.array_equal(one.nodes, other.nodes)
+    config = replace(TINY, n_nodes=(9, 9), n_agents=(2, 2), teacher_iterations=200)
+    shown = demonstrate(config, 0)
+    taught = [float(part) for part in -replayed_rewards(shown, config)]
+    from mtsp_env.reference import improve
+
+    best = [makespan(x, improve(Instance(x, 2), iterations=5000)) for x in shown.nodes]
+    assert np.mean(taught) <= 1.002 * np.mean(best)  # tidy tours may give away a little of the makespan
+
+
+def replayed_rewards(shown, config):
+    env = environment(shown.nodes.shape[1], shown.first.shape[1], len(shown.nodes), config)
+    return rollout(follow(shown), env, "greedy", torch.as_tensor(shown.nodes)).reward
+
+
+def test_workers_make_the_same_sets():
+    """Set i from another process is set i."""
+    rows = []
+    for workers in (0, 1):
+        buffer = Buffer(replace(TINY, workers=workers), np.random.default_rng(0))
+        rows.append(torch.cat([row["cities"].flatten() for _ in range(3) for row in buffer.draw(2)]))
+        buffer.close()
+    assert torch.equal(*rows)
+
+
+def test_every_decision_of_a_set_is_drawn_once():
+    buffer = Buffer(replace(TINY, rows=1, buffer=1), np.random.default_rng(0))
+    decisions, valid = replay(demonstrate(TINY, 0), TINY)
+    drawn = torch.cat([buffer.draw(1)[0]["action"] for _ in range(len(valid))])
+    assert buffer.sets == []  # used up: the next draw takes a fresh set
+    assert sorted(drawn.tolist()) == sorted(decisions["action"][valid].tolist())
+    buffer.draw(1)
+    assert buffer.indices in ([1], [])
+    half = Buffer(replace(TINY, passes=0.5), np.random.default_rng(0))
+    half.draw(2)
+    assert sum(map(len, half.left)) + 2 == sum(round(0.5 * len(valid)) for _, valid in half.sets)
+
+
+def test_the_learning_rate_warms_up_and_falls_to_its_end():
+    config = replace(TINY, steps=100, warmup=10, final_rate=0.1)
+    rates = [rate(config, step) for step in range(101)]
+    assert rates[0] == 0.1 and rates[10] == 1.0 and rates[100] == pytest.approx(0.1)
+    assert rates[:10] == sorted(rates[:10]) and rates[10:] == sorted(rates[10:], reverse=True)
+
+
+def test_resume_is_bit_identical(tmp_path, monkeypatch):
+    imitate(replace(TINY, out=tmp_path / "whole"))
+
+    def interrupted(self):
+        logs = train_step(self)
+        if self.step == 7:
+            signal.raise_signal(signal.SIGTERM)
+        return logs
+
+    train_step = Imitator.train_step
+    monkeypatch.setattr(Imitator, "train_step", interrupted)
+    assert imitate(replace(TINY, out=tmp_path / "parts")).step == 7
+    torch.manual_seed(123)  # whatever happened in between
+    assert imitate(replace(TINY, out=tmp_path / "parts", resume=True)).step == 24
+    whole, parts = (checkpoint.read(tmp_path / name / "checkpoint.pt") for name in ("whole", "parts"))
+    for key in ("network", "average", "optimiser", "schedule", "buffer"):
+        assert same(whole[key], parts[key]), key
+    assert whole["random"]["numpy"] == parts["random"]["numpy"]
+    assert whole["progress"]["best"] == parts["progress"]["best"]
+
+
+def same(a, b):
+    if isinstance(a, torch.Tensor):
+        return torch.equal(a, b)
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, (list, tuple)):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    return a == b
+
+
+def test_imitation_learns_what_the_teacher_does(tmp_path):
+    """A few seconds in small: 150 steps at n = 10, m = 2 lower the greedy cost on held-out instances."""
+    config = replace(
+        TINY, out=tmp_path, n_nodes=(10, 10), n_agents=(2, 2), set_tokens=2000, rows=3, steps=150, average=0.9,
+        learning_rate=3e-3, warmup=10, validate_every=1000, checkpoint_every=1000,
+        network=DANConfig(embed_dim=32, feedforward_dim=64, n_heads=4, city_layers=1, prune_visited=True),
+    )  # fmt: skip
+    held_out = [Instances(torch.rand(256, 10, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1)), 2)]
+    before = costs(Imitator(config).policy(), held_out, config)
+    learner = imitate(config)
+    after = costs(learner.policy(), held_out, config)
+    assert better(after, before, 1e-6)
+    assert after.mean() < 0.85 * before.mean()  # 0.76
+    reward = play(learner.policy(), held_out[0], config, "greedy").reward
+    assert torch.equal(-reward, after)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"depot": "open"}, "depot must be 'final'"),
+        ({"n_nodes": (3, 9), "n_agents": (3, 3), "nodes_per_agent": 1}, r"n_nodes\[0\] must be above"),
+        ({"nodes_per_agent": 11}, r"nodes_per_agent must be at most n_nodes\[0\] // n_agents\[0\] = 10, got 11"),
+        ({"rows": 17}, "rows must be at most buffer=16, got 17"),
+        ({"passes": 0.0}, "passes must be above 0 and at most 1"),
+        ({"average": 1.0}, "average must be at least 0 and below 1"),
+    ],
+)
+def test_bad_configurations_are_named(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        ImitateConfig(**kwargs)
+
+
+def test_the_command_line_imitates(tmp_path, capsys):
+    small = ["--n-nodes", "6", "7", "--n-agents", "1", "2", "--nodes-per-agent", "2", "--set-tokens", "100",
+             "--buffer", "4", "--network.embed-dim", "16", "--validation-instances", "4", "--out", str(tmp_path),
+             "--no-tensorboard", "--teacher-iterations", "5"]  # fmt: skip
+    assert main(["imitate", "--steps", "2", *small]) == 0
+    assert main(["imitate", "--steps", "2", *small]) == 2
+    assert "give --resume" in capsys.readouterr().err
+    assert main(["imitate", "--steps", "3", "--resume", *small]) == 0
+    assert checkpoint.read(tmp_path / "checkpoint.pt")["progress"]["step"] == 3
