@@ -20,15 +20,15 @@ class DANConfig:
     """What a DAN looks like; presets ``DANConfig.paper()`` and ``DANConfig.official()``.
 
     Raises:
-        ValueError: a size below 1, heads that do not divide the width, an unknown norm.
+        ValueError: a size below 1 (agent layers: 0), heads that do not divide the width, an unknown norm.
     """
 
     embed_dim: int = 128  # d
     feedforward_dim: int = 512
     n_heads: int = 8
     city_layers: int = 3
-    agent_layers: int = 1
-    city_agent_layers: int = 1
+    agent_layers: int = 1  # 0: no agent encoder, an ablation
+    city_agent_layers: int = 1  # 0: cities do not attend to agents, an ablation
     encoder_norm: Norm = "pre"
     decoder_norm: Norm = "post"
     tanh_clip: float = 10.0  # C: logits lie in [-C, C]
@@ -36,9 +36,9 @@ class DANConfig:
 
     def __post_init__(self) -> None:
         for name in ("embed_dim", "feedforward_dim", "n_heads", "city_layers", "agent_layers", "city_agent_layers"):
-            value = getattr(self, name)
-            if not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
+            value, least = getattr(self, name), 0 if "agent" in name else 1
+            if not isinstance(value, int) or value < least:
+                raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
         if self.embed_dim % self.n_heads:
             raise ValueError(f"n_heads must divide embed_dim={self.embed_dim}, got {self.n_heads}")
         for norm in (self.encoder_norm, self.decoder_norm):

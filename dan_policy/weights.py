@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
+from torch import nn
 
 from dan_policy.network import DAN, DANConfig
 
@@ -17,13 +18,14 @@ FORMAT = "dan-policy-1"
 SHIPPED = Path(__file__).parent / "weights"
 
 
-def save(path: str | os.PathLike, network: DAN, **extra: object) -> None:
+def save(path: str | os.PathLike, network: nn.Module, **extra: object) -> None:
     """Write ``network`` to a ``.safetensors`` file; ``extra`` (JSON values: how it was trained) into its metadata.
 
-    Written to a temporary name and moved, so that a crash leaves an older file whole.
+    A DAN's file holds its configuration; any other network's holds its weights alone. Written to a temporary name and moved, so that a crash leaves an older file whole.
     """
     path = Path(path)
-    metadata = {"format": FORMAT, "config": json.dumps(asdict(network.config)), "extra": json.dumps(extra)}
+    config = asdict(network.config) if isinstance(network, DAN) else None
+    metadata = {"format": FORMAT, "config": json.dumps(config), "extra": json.dumps(extra)}
     tensors = {key: value.detach().cpu().contiguous() for key, value in network.state_dict().items()}
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -33,19 +35,24 @@ def save(path: str | os.PathLike, network: DAN, **extra: object) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def load(path: str | os.PathLike, device: torch.device | str = "cpu") -> DAN:
+def load(
+    path: str | os.PathLike, device: torch.device | str = "cpu", network: nn.Module | None = None
+) -> DAN | nn.Module:
     """The network that ``save`` wrote to ``path``, or a shipped one by its name ("default"), in evaluation mode.
+
+    Args:
+        network: gets the weights, where they are not those of a DAN (which a file describes by itself).
 
     Raises:
         OSError: no such file.
-        ValueError: not such a file, a damaged one, or weights that do not fit their configuration.
+        ValueError: not such a file, a damaged one, or weights that do not fit their configuration or ``network``.
     """
-    return _read(path, device)[0]
+    return _read(path, device, network)
 
 
 def load_extra(path: str | os.PathLike) -> dict:
     """What was given to ``save`` beside the network. Raises as ``load``."""
-    return _read(path, "cpu")[1]
+    return json.loads(_open(find(path), "cpu")[0]["extra"])
 
 
 def shipped() -> list[str]:
@@ -63,8 +70,23 @@ def find(path: str | os.PathLike) -> Path:
     return path
 
 
-def _read(path: str | os.PathLike, device: torch.device | str) -> tuple[DAN, dict]:
+def _read(path: str | os.PathLike, device: torch.device | str, network: nn.Module | None) -> nn.Module:
     path = find(path)
+    metadata, tensors = _open(path, device)
+    try:
+        config = json.loads(metadata["config"])
+        if network is None:
+            if config is None:
+                raise ValueError("it holds no DAN: give the network that the weights are for")
+            network = DAN(DANConfig(**config))
+        network.load_state_dict(tensors)
+    except (KeyError, TypeError, RuntimeError, ValueError) as error:
+        raise ValueError(f"{path}: weights and configuration do not fit ({error})") from error
+    return network.to(device).eval()
+
+
+def _open(path: Path, device: torch.device | str) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
+    """Metadata and tensors of a file that ``save`` wrote."""
     try:
         with safe_open(path, framework="pt", device=str(device)) as file:
             metadata = file.metadata() or {}
@@ -73,10 +95,4 @@ def _read(path: str | os.PathLike, device: torch.device | str) -> tuple[DAN, dic
         raise ValueError(f"{path}: not a safetensors file, or a damaged one ({error})") from error
     if metadata.get("format") != FORMAT:
         raise ValueError(f"{path}: expected format {FORMAT!r} in its metadata, got {metadata.get('format')!r}")
-    try:
-        network = DAN(DANConfig(**json.loads(metadata["config"])))
-        extra = json.loads(metadata["extra"])
-        network.load_state_dict(tensors)
-    except (KeyError, TypeError, RuntimeError, ValueError) as error:
-        raise ValueError(f"{path}: weights and configuration do not fit ({error})") from error
-    return network.to(device).eval(), extra
+    return metadata, tensors

@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives import ReinforceLoss
 
+from benchmarks.policies.attention_model import AttentionModel
 from dan_policy import DANConfig, make_actor
 from train import checkpoint
 from train.__main__ import main
@@ -321,6 +322,18 @@ def test_training_lowers_the_greedy_cost_on_held_out_instances(tmp_path):
 def test_bad_configurations_are_named(kwargs, message):
     with pytest.raises(ValueError, match=message):
         ReinforceConfig(**kwargs)
+
+
+def test_a_network_of_ones_own_is_trained_saved_and_continued(tmp_path):
+    policy = "benchmarks.policies.attention_model:AttentionModel"
+    trainer = reinforce(replace(TINY, out=tmp_path, policy=policy, steps=2))
+    assert isinstance(trainer.network, AttentionModel)
+    again = Trainer(replace(TINY, policy=policy, init=str(tmp_path / "last.safetensors")))
+    assert same(dict(again.network.state_dict()), dict(trainer.network.state_dict()))
+    with pytest.raises(ValueError, match="it holds no DAN"):
+        Trainer(replace(TINY, init=str(tmp_path / "last.safetensors")))
+    with pytest.raises(ValueError, match=r"policy must be package.module:factory, got 'nothing.here:at_all'"):
+        Trainer(replace(TINY, policy="nothing.here:at_all"))
 
 
 def test_presets_follow_the_paper():

@@ -55,6 +55,8 @@ class RunConfig:
     """Whether an agent that is back at the depot may leave again."""
 
     network: DANConfig = field(default_factory=DANConfig.paper)
+    policy: str | None = None
+    """A network of your own instead of a DAN: package.module:factory, called without arguments."""
     init: str | None = None
     """Weights to start from: a file, or the name of a shipped model (its configuration replaces `network`)."""
     max_grad_norm: float = 1.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pkgutil
 import signal
 import sys
 import time
@@ -38,8 +39,7 @@ class Learner(ABC):
             torch.set_num_threads(config.threads)
         torch.manual_seed(config.seed)
         self.rng = np.random.default_rng(config.seed)
-        network = load(config.init) if config.init else DAN(config.network)
-        self.network = network.to(find_device(config.device)).train()
+        self.network = make_network(config).to(find_device(config.device)).train()
         if world_size() > 1:  # the same network everywhere, then everybody's own instances and actions
             torch.manual_seed(config.seed + rank())
             self.rng = np.random.default_rng([config.seed, rank()])
@@ -107,6 +107,22 @@ class Learner(ABC):
         for name, value in state["progress"].items():
             setattr(self, name, value)
         checkpoint.set_random_state(self.rng, state["random"])
+
+
+def make_network(config: RunConfig) -> nn.Module:
+    """A DAN, or what ``config.policy`` makes; with the weights of ``config.init`` where given.
+
+    Raises:
+        OSError: no such weights.
+        ValueError: no such factory, or weights that do not fit.
+    """
+    if config.policy is None:
+        return load(config.init) if config.init else DAN(config.network)
+    try:
+        network = pkgutil.resolve_name(config.policy)()
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"policy must be package.module:factory, got {config.policy!r} ({error})") from error
+    return load(config.init, network=network) if config.init else network
 
 
 def checkpoint_path(config: RunConfig) -> Path:
