@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 
+import numpy as np
 import torch
 from torch import nn
 
@@ -15,6 +16,7 @@ from dan_policy.actor import make_actor
 from dan_policy.episode import Decode, find_device, rollout
 from dan_policy.network import DAN
 from dan_policy.weights import find, load
+from mtsp_env import rules
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.instance import Instance, Tours, check_count
 from mtsp_env.tours import check_tours, makespan
@@ -75,19 +77,13 @@ def solve(
     polish = None if improve is None else _polish(improve, seed)
     device = find_device(device)
     sharp = decode == "sample" and instance.n_nodes >= SHARP_FROM
-    actor = _actor(policy, device, sharp)
+    policy = _ready(policy, device, sharp)
 
     start = time.perf_counter()
-    rows = samples if decode == "sample" else 1
-    env = BatchedMTSP(
-        instance.n_nodes, instance.n_agents, [rows], SPEED, depot="final", device=device, check_actions=False
-    )
-    nodes = torch.as_tensor(instance.nodes.copy(), device=device).expand(rows, -1, -1)
-    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
-        torch.manual_seed(seed)
-        last = rollout(actor, env, decode, nodes).last
-    best = env.makespan(last).argmin()[None]
-    tours = env.tours(last[best])[0]
+    if decode == "greedy" and isinstance(policy, DAN) and device.type == "cpu":
+        tours = _play_alone(policy, instance)
+    else:
+        tours = _play(policy, instance, decode, samples if decode == "sample" else 1, seed, device)
     if polish is not None:
         tours = polish(instance, tours)
     seconds = time.perf_counter() - start
@@ -109,7 +105,34 @@ def _polish(seconds: float, seed: int) -> Callable[[Instance, Tours], Tours]:
     return partial(reference.improve, seconds=seconds, seed=seed)
 
 
-def _actor(policy: str | os.PathLike | nn.Module, device: torch.device, sharp: bool) -> nn.Module:
+def _play(policy: nn.Module, instance: Instance, decode: Decode, rows: int, seed: int, device: torch.device) -> Tours:
+    """The best of ``rows`` games, side by side."""
+    actor = make_actor(policy) if isinstance(policy, DAN) else policy
+    env = BatchedMTSP(
+        instance.n_nodes, instance.n_agents, [rows], SPEED, depot="final", device=device, check_actions=False
+    )
+    nodes = torch.as_tensor(instance.nodes.copy(), device=device).expand(rows, -1, -1)
+    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+        torch.manual_seed(seed)
+        last = rollout(actor, env, decode, nodes).last
+    best = env.makespan(last).argmin()[None]
+    return env.tours(last[best])[0]
+
+
+@torch.inference_mode()
+def _play_alone(network: DAN, instance: Instance) -> Tours:
+    """One greedy game, the same as ``_play``'s, with the rules on NumPy arrays: replanning takes half the time."""
+    game = rules.make_rules(instance.n_nodes, instance.n_agents, SPEED, "final", "sparse", None)
+    state = rules.start(instance.nodes[None], instance.n_agents)
+    while not rules.all_visited(state)[0]:
+        seen = rules.observe(state, game)
+        logits = network(*(torch.from_numpy(part) for part in (seen.cities, seen.agents, seen.visited)))  # (1, n)
+        state = rules.depart(state, game, np.where(seen.action_mask, logits.numpy(), -np.inf).argmax(1))
+    return rules.tours(state.visits[0], state.destination[0])
+
+
+def _ready(policy: str | os.PathLike | nn.Module, device: torch.device, sharp: bool) -> nn.Module:
+    """A DAN, or an actor, on its device."""
     if not isinstance(policy, nn.Module):
         file = find(policy)
         policy = _loaded(file, file.stat().st_mtime_ns, device)
@@ -119,7 +142,7 @@ def _actor(policy: str | os.PathLike | nn.Module, device: torch.device, sharp: b
         clipped = DAN(replace(policy.config, tanh_clip=SHARP_CLIP))
         clipped.load_state_dict(policy.state_dict())
         policy = clipped
-    return make_actor(policy.to(device).eval())
+    return policy.to(device).eval()
 
 
 @lru_cache(maxsize=4)

@@ -21,7 +21,8 @@ SHIPPED = Path(__file__).parent / "weights"
 def save(path: str | os.PathLike, network: nn.Module, **extra: object) -> None:
     """Write ``network`` to a ``.safetensors`` file; ``extra`` (JSON values: how it was trained) into its metadata.
 
-    A DAN's file holds its configuration; any other network's holds its weights alone. Written to a temporary name and moved, so that a crash leaves an older file whole.
+    A DAN's file holds its configuration; any other network's holds its weights alone. Written to a temporary name and
+    moved, so that a crash leaves an older file whole.
     """
     path = Path(path)
     config = asdict(network.config) if isinstance(network, DAN) else None
