@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import platform
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,6 +13,7 @@ from rich.table import Table
 from torch.utils.flop_counter import FlopCounterMode
 from torchrl.envs.utils import step_mdp
 
+from benchmarks.run import describe_machine
 from dan_policy import DAN, DANConfig, load, make_actor, rollout
 from dan_policy.episode import find_device
 from mtsp_env import mtsp_v0
@@ -25,14 +24,10 @@ from train.reinforce import Trainer
 
 def machine(device: str = "cpu") -> str:
     """Processor, cores and versions, for the head of a table."""
-    name = platform.processor() or platform.machine()
-    if os.path.exists("/proc/cpuinfo"):
-        with open("/proc/cpuinfo") as file:
-            names = [line.split(":", 1)[1].strip() for line in file if line.startswith("model name")]
-        name = names[0] if names else name
+    here = describe_machine()
     gpu = f", {torch.cuda.get_device_name()}" if device == "cuda" else ""
     return (
-        f"{name}, {os.cpu_count()} cores{gpu}; Python {platform.python_version()}, NumPy {np.__version__}, "
+        f"{here['processor']}, {here['cores']} cores{gpu}; Python {here['python']}, NumPy {np.__version__}, "
         f"torch {torch.__version__} with {torch.get_num_threads()} threads"
     )
 
@@ -74,7 +69,8 @@ def per_second(work: Callable[[], int], seconds: float, wait: Callable[[], None]
     return done / elapsed
 
 
-def _wait(device: str) -> Callable[[], None]:
+def wait_for(device: str) -> Callable[[], None]:
+    """What waits until the device has done its work."""
     return torch.cuda.synchronize if device == "cuda" else lambda: None
 
 
@@ -86,7 +82,7 @@ def matmul_rate(device: str) -> float:
         a @ a
         return 2 * 2048**3
 
-    return per_second(multiply, 1.0, _wait(device))
+    return per_second(multiply, 1.0, wait_for(device))
 
 
 def aec_decisions(n_nodes: int, n_agents: int, seconds: float) -> float:
@@ -115,7 +111,7 @@ def batched_decisions(batch: int, device: str, seconds: float) -> float:
             td = step_mdp(env.step(env.rand_action(td)))
         return int(td["decisions"].sum())
 
-    return per_second(episodes, seconds, _wait(device))
+    return per_second(episodes, seconds, wait_for(device))
 
 
 def greedy_instances(network: DAN, device: str, seconds: float) -> tuple[float, float]:
@@ -129,7 +125,7 @@ def greedy_instances(network: DAN, device: str, seconds: float) -> tuple[float, 
         rollout(actor, env, "greedy")
         return 64
 
-    return per_second(batch, seconds, _wait(device)), counter.get_total_flops() / 64
+    return per_second(batch, seconds, wait_for(device)), counter.get_total_flops() / 64
 
 
 def trained_instances(device: str, precision: str, seconds: float) -> float:
@@ -151,7 +147,7 @@ def trained_instances(device: str, precision: str, seconds: float) -> float:
         trainer.train_step()
         return trainer.config.batch_size
 
-    return per_second(step, seconds, _wait(device))
+    return per_second(step, seconds, wait_for(device))
 
 
 def main(device: str = "cpu", seconds: float = 3.0) -> None:

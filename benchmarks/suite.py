@@ -1,17 +1,21 @@
-"""Test sets: fixed instances that nothing is ever trained or tuned on."""
+"""Test sets: the instances of the paper's tables, which nothing is ever trained or tuned on."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
-from mtsp_env.instance import Instance, sample_nodes
+from mtsp_env.instance import Instance, Tours, check_count, sample_nodes
+from mtsp_env.tsplib import read_tsplib
+
+SEED = 7  # of the published results
 
 
 @dataclass(frozen=True)
 class Cell:
-    """Instances of one size: ``count`` of them, drawn by (seed, n, m) alone."""
+    """Uniform instances of one size: ``count`` of them, drawn by (seed, n, m) alone."""
 
     n_nodes: int
     n_agents: int
@@ -30,16 +34,131 @@ class Cell:
         """For example "50x5": n = 50, m = 5."""
         return f"{self.n_nodes}x{self.n_agents}"
 
+    @property
+    def heading(self) -> str:
+        """For a table's head: "50, 5"."""
+        return f"{self.n_nodes}, {self.n_agents}"
 
-SETS: dict[str, tuple[Cell, ...]] = {
+    @property
+    def printed(self) -> list[str | int]:
+        """What ``published.json`` calls it."""
+        return [self.n_nodes, self.n_agents]
+
+    def file(self, seed: int) -> str:
+        """Where its best known tours are kept."""
+        return f"uniform-{self.label}-seed{seed}.json"
+
+
+@dataclass(frozen=True)
+class TsplibCell:
+    """One file of TSPLIB, its first node the depot; not drawn, so that seeds do not matter.
+
+    Attributes:
+        file_name: without ".tsp".
+        n_nodes: n, which the file must have.
+        n_agents: m.
+        folder: where the file is; None: not known, and there is no instance.
+        paper_name: what the paper calls it, where it errs.
+    """
+
+    file_name: str
+    n_nodes: int
+    n_agents: int
+    folder: Path | None = None
+    paper_name: str | None = None
+    count: int = 1
+
+    @property
+    def path(self) -> Path | None:
+        """The file itself."""
+        return self.folder / f"{self.file_name}.tsp" if self.folder else None
+
+    def instances(self, seed: int) -> list[Instance]:
+        """The one instance. Raises OSError or ValueError where there is none, or another than expected."""
+        if self.path is None:
+            raise ValueError(f"{self.label} is read from a TSPLIB file: say where with --tsplib DIR")
+        instance = read_tsplib(self.path, self.n_agents)
+        if instance.n_nodes != self.n_nodes:
+            raise ValueError(f"{self.path}: {self.n_nodes} nodes expected, got {instance.n_nodes}")
+        return [instance]
+
+    @property
+    def label(self) -> str:
+        """For example "eil51x5": m = 5."""
+        return f"{self.file_name}x{self.n_agents}"
+
+    @property
+    def heading(self) -> str:
+        """For a table's head: "eil51, 5"."""
+        return f"{self.file_name}, {self.n_agents}"
+
+    @property
+    def printed(self) -> list[str | int]:
+        """What ``published.json`` calls it."""
+        return [self.paper_name or self.file_name, self.n_agents]
+
+    def file(self, seed: int) -> str:
+        """Where its best known tours are kept."""
+        return f"{self.label}.json"
+
+
+AnyCell = Cell | TsplibCell
+
+# The paper prints gtsp150's costs under "kroa150": with TSPLIB's kroA150 and its first node as the depot, the trip to
+# the farthest city and back alone is 5395, with gtsp150 it is the 1554.64 that the row shows.
+_TSPLIB = (("eil51", 51), ("eil76", 76), ("eil101", 101), ("gtsp150", 150), ("tsp225", 225))
+
+TABLES: dict[str, tuple[AnyCell, ...]] = {
+    "1": tuple(
+        Cell(n, m, 20) for n, teams in ((50, (5, 7, 10)), (100, (5, 10, 15)), (200, (10, 15, 20))) for m in teams
+    ),
+    "2": tuple(Cell(n, 10, 5) for n in (500, 600, 700, 800, 900, 1000)),
+    "3": tuple(
+        TsplibCell(name, n, m, paper_name="kroa150" if name == "gtsp150" else None)
+        for name, n in _TSPLIB
+        for m in ((5, 10) if n < 150 else (10, 20))
+    ),
+    "figure4": tuple(Cell(n, 5, 5) for n in (20, 50, 100, 140, 200, 350, 500, 700, 1000)),  # the paper's ends at 140
     "smoke": (Cell(8, 2, 3),),
-    "first": (Cell(20, 3, 25), Cell(30, 5, 25), Cell(50, 5, 25), Cell(100, 10, 25)),
 }
-SEED = 7  # of the published results
 
 
-def cells(name: str) -> tuple[Cell, ...]:
-    """The cells of a named set. Raises ValueError where there is no such set."""
-    if name not in SETS:
-        raise ValueError(f"unknown set {name!r}; choose from {sorted(SETS)}")
-    return SETS[name]
+def cells(table: str, tsplib: Path | None = None, count: int | None = None) -> tuple[AnyCell, ...]:
+    """The cells of a table, with ``count`` instances each (None: as many as TABLES says).
+
+    Where ``tsplib`` names a folder, cells whose file is not in it are left out.
+
+    Raises:
+        ValueError: no such table, a bad ``count``, or a folder without any of the files.
+    """
+    if table not in TABLES:
+        raise ValueError(f"unknown table {table!r}; choose from {sorted(TABLES)}")
+    found = TABLES[table]
+    if count is not None:
+        check_count("instances", count, minimum=1)
+        if any(isinstance(cell, TsplibCell) for cell in found) and count != 1:
+            raise ValueError(f"table {table} has 1 instance in each cell, got instances = {count}")
+        found = tuple(replace(cell, count=count) for cell in found)
+    if tsplib is not None:
+        found = tuple(replace(cell, folder=tsplib) if isinstance(cell, TsplibCell) else cell for cell in found)
+        found = tuple(cell for cell in found if not isinstance(cell, TsplibCell) or cell.path.is_file())
+        if not found:
+            raise ValueError(f"{tsplib}: none of {', '.join(f'{name}.tsp' for name, _ in _TSPLIB)}")
+    return found
+
+
+def find_cell(table: str, label: str) -> AnyCell:
+    """The cell of a table by its label. Raises ValueError where there is none."""
+    for cell in cells(table):
+        if cell.label == label:
+            return cell
+    raise ValueError(f"table {table} has no cell {label!r}; choose from {[cell.label for cell in cells(table)]}")
+
+
+def rounded_length(instance: Instance, tours: Tours) -> int:
+    """Longest tour in the file's units, each leg rounded to the nearest whole number: TSPLIB 95's rule for EUC_2D.
+
+    The paper's Table 3 counts so: two of its costs are below what unrounded lengths allow.
+    """
+    lengths = (np.linalg.norm(np.diff(instance.nodes[tour], axis=0), axis=1) * instance.scale for tour in tours)
+    return max(int(np.floor(legs + 0.5).sum()) for legs in lengths)

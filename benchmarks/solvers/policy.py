@@ -1,24 +1,33 @@
-"""Policies played in the environment: the shipped DAN and the two that every learned one must beat."""
+"""Policies played in the environment: the shipped DAN and the two that every learned one must beat.
+
+All on the CPU, as every other solver: times are to be compared.
+"""
 
 from __future__ import annotations
 
 from benchmarks.policies import nearest as simple
-from dan_policy import make_actor, solve
+from dan_policy import make_actor
+from dan_policy import solve as play
 from mtsp_env.instance import Instance, Tours
 
 
-def dan(instance: Instance, seconds: float, seed: int, samples: int | None, policy: str = "default") -> Tours:
+def dan(instance: Instance, seconds: float, seed: int, samples: int | None = None, policy: str = "default") -> Tours:
     """The shipped DAN, greedy (``samples`` None) or the best of ``samples`` (paper, Sec. 6). Ignores ``seconds``."""
     if samples is None:
-        return solve(instance, policy).tours
-    return solve(instance, policy, "sample", samples, seed).tours
+        return play(instance, policy, device="cpu").tours
+    return play(instance, policy, "sample", samples, seed, device="cpu").tours
+
+
+def improved_dan(instance: Instance, seconds: float, seed: int, policy: str = "default") -> Tours:
+    """The shipped DAN, greedy, its tours polished by the reference solver for ``seconds`` after that."""
+    return play(instance, policy, seed=seed, device="cpu", improve=seconds).tours
 
 
 def nearest(instance: Instance, seconds: float, seed: int) -> Tours:
     """Each agent goes to the nearest unvisited city. Ignores ``seconds``."""
-    return solve(instance, make_actor(simple.nearest)).tours
+    return play(instance, make_actor(simple.nearest), device="cpu").tours
 
 
 def uniformly_random(instance: Instance, seconds: float, seed: int) -> Tours:
     """One game of uniformly random legal actions. Ignores ``seconds``."""
-    return solve(instance, make_actor(simple.uniformly_random), "sample", 1, seed).tours
+    return play(instance, make_actor(simple.uniformly_random), "sample", 1, seed, device="cpu").tours
