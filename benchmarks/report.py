@@ -15,6 +15,8 @@ from benchmarks.stats import Mean, Paired, Results, load, mean
 from benchmarks.suite import TsplibCell
 
 PUBLISHED = Path(__file__).with_name("published.json")
+FULL_SHARE = 0.9  # of a core, where a solver has one to itself
+SHORT = 0.3  # seconds below which the shares say nothing
 
 TITLES = {
     "1": "Table 1: uniform instances, n up to 200",
@@ -88,7 +90,17 @@ def _origin(found: Sequence[Results], files: Sequence[Path]) -> list[str]:
         "",
         *(f"- {machine}: {count} rows" for machine, count in machines.most_common()),
         f"- {', '.join(versions)}",
+        *_starved(rows),
     ]
+
+
+def _starved(rows: Sequence[Row]) -> list[str]:
+    """Whether solvers had their cores to themselves: they wait for nothing else, so wall and CPU time should agree."""
+    timed = [row for row in rows if row.ok and row.cpu_seconds is not None and row.seconds > SHORT]
+    starved = sum(row.cpu_seconds < FULL_SHARE * row.seconds for row in timed)
+    if not starved:
+        return []
+    return [f"- {starved} of {len(timed)} solves had less than {FULL_SHARE:.0%} of a core: the machine was not quiet"]
 
 
 def _table(results: Results, against: str) -> list[str]:

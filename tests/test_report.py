@@ -125,6 +125,15 @@ def test_failures_are_counted_and_told(tmp_path):
     assert "\n2. of 3: 3 × crash: killed by SIGSEGV / core\n" in text
 
 
+def test_a_busy_machine_is_told(tmp_path):
+    rows = measured("reference", HALVES, budget=1.0)  # a second of wall time each
+    alone = [replace(r, cpu_seconds=0.95) for r in rows]
+    assert "of a core" not in report([write(tmp_path / "alone.jsonl", alone)])
+    assert "of a core" not in report([write(tmp_path / "short.jsonl", [replace(r, seconds=0.1) for r in alone])])
+    shared = [replace(alone[0], cpu_seconds=0.5), *alone[1:]]
+    assert "- 1 of 3 solves had less than 90% of a core" in report([write(tmp_path / "shared.jsonl", shared)])
+
+
 def test_the_later_row_counts(tmp_path):
     first = [failed(r, "error", "no") for r in measured("nearest", HALVES)]
     (results,) = stats.load([write(tmp_path / "rows.jsonl", first + measured("nearest", ALL_BY_ONE))])
