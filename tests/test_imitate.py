@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from states import same
 
 from dan_policy import DANConfig
 from dan_policy.episode import rollout
@@ -168,16 +169,6 @@ def test_resume_is_bit_identical(tmp_path, monkeypatch):
         assert same(whole[key], parts[key]), key
     assert whole["random"]["numpy"] == parts["random"]["numpy"]
     assert whole["progress"]["best"] == parts["progress"]["best"]
-
-
-def same(a, b):
-    if isinstance(a, torch.Tensor):
-        return torch.equal(a, b)
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
-    if isinstance(a, (list, tuple)):
-        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
-    return a == b
 
 
 def test_imitation_learns_what_the_teacher_does(tmp_path):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from states import same
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives import ReinforceLoss
@@ -221,17 +222,6 @@ def test_drawn_sizes_cover_their_ranges():
     sizes = {(part.nodes.shape[1], part.n_agents) for part in (draw(rng, TINY, 2) for _ in range(200))}
     assert sizes == {(n, m) for n in range(5, 9) for m in range(1, 4)}
     assert sum(len(part.nodes) for part in draw_set(rng, TINY, 21)) == 21
-
-
-def same(a, b):
-    """Deep equality, to the bit."""
-    if isinstance(a, torch.Tensor):
-        return torch.equal(a, b)
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
-    if isinstance(a, (list, tuple)):
-        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
-    return a == b
 
 
 def test_resume_is_bit_identical(tmp_path):
