@@ -22,7 +22,7 @@ from mtsp_env.tsplib import read_tsplib
 from mtsp_env.version import __version__
 
 METHODS = {  # each with the options that are its own
-    "dan": ("policy", "decode", "samples", "device", "improve"),
+    "dan": ("policy", "decode", "samples", "device", "precision", "improve"),
     "reference": ("seconds",),
 }
 DEFAULT_SAMPLES = 64  # the paper's DAN(s.64)
@@ -105,6 +105,7 @@ def _dan(args: argparse.Namespace) -> Callable[[Instance], Plan]:
             seed=args.seed,
             device=args.device or "cpu",
             improve=args.improve,
+            precision=args.precision or "auto",
         )
         return Plan(solution.tours, solution.seconds, solution.method)
 
@@ -314,6 +315,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     option("--samples", type=_whole(1), metavar="K", help=f"with --decode sample (default: {DEFAULT_SAMPLES})")
     option("--device", help="--method dan: cpu, cuda, cuda:1, ... (default: cpu)")
+    option(
+        "--precision",
+        choices=("auto", "float32", "bfloat16"),
+        help="--method dan: auto takes bfloat16 where that is faster (default: auto)",
+    )
     option("--improve", type=_seconds, metavar="SECONDS", help="--method dan: polish its tours for so many seconds")
     option("--plot", metavar="PATH", help="draw the tours: .png, .svg, .pdf, ...")
     option("--out", metavar="PATH", help="write the tours as JSON")

@@ -146,6 +146,8 @@ class DAN(nn.Module):
         """Gather each row's unvisited nodes to the front, padded to the longest row; scatter their logits back."""
         is_open = ~visited
         longest = int(is_open.sum(1).max())
+        if torch.is_autocast_enabled(cities.device.type):
+            longest = min(_round_up(longest), visited.shape[1])
         kept = torch.argsort(visited.to(torch.uint8), dim=1, stable=True)[:, :longest]  # (B, k), the depot first
         real = is_open.gather(1, kept)  # (B, k) False at the padding
         logits = self._logits(
@@ -189,6 +191,15 @@ def _attention(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None) -> Tensor:
         u = u if mask is None else u.masked_fill(~mask, -torch.inf)
         return torch.softmax(u, dim=-1) @ v
     return F.scaled_dot_product_attention(q, k, v, mask)
+
+
+def _round_up(length: int) -> int:
+    """To the next of a few lengths, at most an eighth longer from 64 on: bfloat16 kernels are built once per shape.
+
+    On CPUs building them takes longer than using them once.
+    """
+    step = max(8, 1 << (length - 1).bit_length() >> 4)
+    return -(-length // step) * step
 
 
 def _mean(h: Tensor, real: Tensor | None) -> Tensor:

@@ -97,15 +97,32 @@ def test_json_is_the_judges_verdict_in_the_units_of_the_file(folder, solver, cap
     assert found["makespan"] == pytest.approx(max(by_hand))
     assert found["lower_bound"] == pytest.approx(15.0)
     assert solver.calls == [
-        {"policy": "default", "decode": "greedy", "samples": 64, "seed": 0, "device": "cpu", "improve": None}
+        {
+            "policy": "default",
+            "decode": "greedy",
+            "samples": 64,
+            "seed": 0,
+            "device": "cpu",
+            "improve": None,
+            "precision": "auto",
+        }
     ]  # the defaults that --help names
 
 
 def test_options_reach_the_solver(folder, solver) -> None:
     options = "--policy a.safetensors --decode sample --samples 7 --seed 5 --device cuda:1 --improve .5 --json"
+    options += " --precision float32"
     assert main(["solve", "square.json", *options.split()]) == 0
     assert solver.calls == [
-        {"policy": "a.safetensors", "decode": "sample", "samples": 7, "seed": 5, "device": "cuda:1", "improve": 0.5}
+        {
+            "policy": "a.safetensors",
+            "decode": "sample",
+            "samples": 7,
+            "seed": 5,
+            "device": "cuda:1",
+            "improve": 0.5,
+            "precision": "float32",
+        }
     ]
 
 

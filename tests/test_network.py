@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from dan_policy import network as module
 from dan_policy.network import DAN, AttentionLayer, DANConfig
 
 SMALL = DANConfig(embed_dim=16, feedforward_dim=32, n_heads=2, city_layers=2)
@@ -106,6 +107,36 @@ def test_the_glimpse_ignores_visited_cities_and_pruning_forgets_them():
     )
     nothing = torch.zeros_like(visited)
     assert torch.allclose(pruned(cities, agents, nothing), whole(cities, agents, nothing), atol=1e-5)
+
+
+def test_bfloat16_pads_to_a_few_lengths():
+    """A kernel is built for each shape: lengths are few, no shorter than asked for and at most 12.5 % longer."""
+    rounded = {length: module._round_up(length) for length in range(1, 1025)}
+    assert all(length <= longer for length, longer in rounded.items())
+    assert all(longer - length < max(8, length / 8) for length, longer in rounded.items())
+    assert len(set(rounded.values())) == 40
+
+
+def test_what_bfloat16_pads_with_is_not_seen(monkeypatch):
+    """Under autocast rows are longer than their open nodes; the logits are those of rows that are not."""
+    network, (cities, agents, visited) = DAN(CONFIGS["pruned"]).eval(), observation(n=30)
+    visited[:, 11:] = True
+    lengths, logits = [], DAN._logits
+
+    def spy(self, kept, *args, **kwargs):
+        lengths.append(kept.shape[1])
+        return logits(self, kept, *args, **kwargs)
+
+    monkeypatch.setattr(DAN, "_logits", spy)
+    exact = open_logits(network, cities, agents, visited)
+    with torch.autocast("cpu", torch.bfloat16):
+        padded = open_logits(network, cities, agents, visited)
+        monkeypatch.setattr(module, "_round_up", lambda length: length)
+        unpadded = open_logits(network, cities, agents, visited)
+    assert lengths == [10, 16, 10]
+    assert torch.allclose(padded, unpadded, atol=0.02)
+    assert torch.allclose(padded, exact, atol=0.2)
+    assert not torch.allclose(padded, exact.roll(1, 0), atol=0.2)
 
 
 def test_attention_layer_is_the_formula():

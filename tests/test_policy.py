@@ -179,6 +179,7 @@ def test_the_policys_tours_are_what_is_improved(network, monkeypatch):
         ({"improve": float("inf")}, "improve must be a finite number above 0, got inf"),
         ({"improve": True}, "improve must be a finite number above 0, got True"),
         ({"improve": "soon"}, "improve must be a finite number above 0, got 'soon'"),
+        ({"precision": "float16"}, "unknown precision 'float16'; choose from \\['auto', 'float32', 'bfloat16'\\]"),
         ({"improve": 1.0, "seed": -1}, "seed must be a whole number of at least 0, got -1"),
     ],
 )
@@ -187,6 +188,41 @@ def test_what_cannot_be_improved_is_not_planned(network, monkeypatch, kwargs, me
     monkeypatch.setattr(solution, "rollout", None)  # calling it would be a TypeError
     with pytest.raises(ValueError, match=message):
         solve(uniform(np.random.default_rng(0), 5, 2), network, **kwargs)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "n_nodes", "expected"),
+    [
+        ({"decode": "sample", "samples": 64}, 8, True),  # 512 nodes side by side
+        ({"decode": "sample", "samples": 62}, 8, False),
+        ({"decode": "greedy"}, 8, False),
+        ({"decode": "greedy", "precision": "bfloat16"}, 8, True),
+        ({"decode": "sample", "samples": 64, "precision": "float32"}, 8, False),
+    ],
+)
+@pytest.mark.parametrize("hardware", [True, False])
+def test_bfloat16_is_for_hardware_and_sizes_that_gain(monkeypatch, kwargs, n_nodes, expected, hardware):
+    seen = set()
+
+    class Spy(DAN):
+        def forward(self, *observation):
+            seen.add(torch.is_autocast_enabled("cpu"))
+            return super().forward(*observation)
+
+    monkeypatch.setattr(solution, "_multiplies_bfloat16", lambda device: hardware)
+    instance = uniform(np.random.default_rng(0), n_nodes, 2)
+    solve(instance, Spy(SMALL), device="cpu", **kwargs)
+    assert seen == {expected and (hardware or "precision" in kwargs)}
+
+
+def test_other_policies_keep_their_precision(monkeypatch):
+    monkeypatch.setattr(solution, "_multiplies_bfloat16", lambda device: True)
+
+    def network(cities, agents, visited):
+        assert not torch.is_autocast_enabled("cpu")
+        return cities.sum(-1)
+
+    solve(uniform(np.random.default_rng(0), 8, 2), make_actor(network), "sample", samples=80, device="cpu")
 
 
 def test_improvement_without_numba_names_the_extra_before_it_plans(network, monkeypatch):

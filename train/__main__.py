@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import Annotated
+
+# Kernels that oneDNN keeps, read when torch is loaded: sizes change all the time, and building one takes milliseconds
+os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "8192")
 
 import tyro
 

@@ -192,8 +192,8 @@ class ImitateConfig(RunConfig):
     """Whether an agent that is back at the depot may leave again: the teacher's never do."""
     network: DANConfig = field(default_factory=lambda: DANConfig(prune_visited=True))
 
-    set_tokens: int = 6400
-    """Instances times nodes of a set, about: a set has this divided by n instances, between 16 and 256."""
+    set_tokens: int = 8192
+    """Instances times nodes of a set, at most: it has the greatest power of two that allows, between 16 and 256."""
     buffer: int = 16
     """Sets that are learnt from at a time."""
     passes: float = 1.0

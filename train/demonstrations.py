@@ -32,6 +32,7 @@ def demonstrate(config: ImitateConfig, index: int) -> Demonstrations:
     rng = np.random.default_rng([config.seed, index])
     n_nodes, n_agents = draw_size(rng, config)
     batch = int(np.clip(config.set_tokens // n_nodes, 16, 256))
+    batch = 1 << batch.bit_length() - 1  # few shapes: few kernels to build
     nodes = sample_nodes(config.distribution, rng, batch, n_nodes)
     iterations = config.teacher_iterations * n_nodes
     tours = improve_batch(nodes, n_agents, iterations, seed=int(rng.integers(2**31)), threads=1, tidy=True)
