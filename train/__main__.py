@@ -38,7 +38,7 @@ def main(argv: list[str] | None = None) -> int:
     """Parse the command line and train. Exit code 2 and one line on bad input."""
     try:
         app.cli(prog="python -m train", args=argv)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ImportError) as error:
         print(f"train: error: {error}", file=sys.stderr)
         return 2
     return 0

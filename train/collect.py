@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torchrl.modules import ProbabilisticActor
 
 from dan_policy.actor import OBSERVATION, make_actor
 from dan_policy.episode import Decode, Episode, rollout
@@ -30,9 +31,18 @@ def draw_size(rng: np.random.Generator, config: RunConfig) -> tuple[int, int]:
     return n_nodes, int(rng.integers(config.n_agents[0], most, endpoint=True))
 
 
-def draw(rng: np.random.Generator, config: RunConfig, batch: int, tokens: int | None = None) -> Instances:
-    """``batch`` fresh instances, fewer where they would hold more than ``tokens`` nodes; one n and m for all."""
-    n_nodes, n_agents = draw_size(rng, config)
+def draw(
+    rng: np.random.Generator,
+    config: RunConfig,
+    batch: int,
+    tokens: int | None = None,
+    size: tuple[int, int] | None = None,
+) -> Instances:
+    """``batch`` fresh instances, fewer where they would hold more than ``tokens`` nodes; one n and m for all.
+
+    ``size`` gives n and m; None draws them.
+    """
+    n_nodes, n_agents = size or draw_size(rng, config)
     batch = batch if tokens is None else max(1, min(batch, tokens // n_nodes))
     nodes = sample_nodes(config.distribution, rng, batch, n_nodes)
     return Instances(torch.as_tensor(nodes, device=config.device), n_agents)
@@ -59,8 +69,8 @@ def draw_set(rng: np.random.Generator, config: RunConfig, count: int, sizes: int
     return [draw(rng, config, part) for part in counts]
 
 
-def play(network: nn.Module, instances: Instances, config: RunConfig, decode: Decode, keep: bool = False) -> Episode:
-    """Whole, on-policy episodes of ``network``, one per instance; ``keep`` the decisions, to learn from them.
+def play(policy: nn.Module, instances: Instances, config: RunConfig, decode: Decode, keep: bool = False) -> Episode:
+    """Whole episodes of a network, or of its actor, one per instance; ``keep`` the decisions, to learn from them.
 
     The one place where training meets the environment: in one process, with ``rollout``.
     """
@@ -68,7 +78,8 @@ def play(network: nn.Module, instances: Instances, config: RunConfig, decode: De
     env = environment(n_nodes, instances.n_agents, batch, config)
     with autocast(config):
         kept = (*OBSERVATION, "action_mask") if keep else ()
-        return rollout(make_actor(network), env, decode, instances.nodes, kept)
+        actor = policy if isinstance(policy, ProbabilisticActor) else make_actor(policy)
+        return rollout(actor, env, decode, instances.nodes, kept)
 
 
 def costs(network: nn.Module, instances: list[Instances], config: RunConfig) -> Tensor:

@@ -120,6 +120,11 @@ class ReinforceConfig(RunConfig):
     curriculum: tuple[tuple[int, int, int, int, int], ...] = ()
     """Later ranges: from step, least n, greatest n, least m, greatest m. Five numbers for each stage."""
 
+    collector: Literal["here", "ray"] = "here"
+    """here: this process plays the episodes. ray: Ray workers do, on this machine or on a cluster (RAY_ADDRESS)."""
+    ray_workers: int = 2
+    """Ray: how many, each playing `batch_size` instances for every optimiser step."""
+
     baseline: Literal["rollout", "shared"] = "rollout"
     """rollout: the best policy so far, greedily (the paper). shared: the other samples of the same instance."""
     samples: int = 1
@@ -144,7 +149,7 @@ class ReinforceConfig(RunConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check_at_least(1, "batch_size", "chunk", "decay_every", "challenge_every")
+        self._check_at_least(1, "batch_size", "chunk", "decay_every", "challenge_every", "ray_workers")
         self._check_at_least(2, "challenge_instances")
         self._check_at_least(2 if self.baseline == "shared" else 1, "samples")
         self._check_positive("learning_rate", "decay")

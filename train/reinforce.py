@@ -8,12 +8,14 @@ from typing import Any
 import torch
 
 from dan_policy.actor import make_actor
+from dan_policy.episode import Episode
 from train.baseline import Baseline, RolloutBaseline, SharedBaseline
-from train.collect import autocast, draw, play, repeat
+from train.collect import Instances, autocast, draw, play, repeat
 from train.config import ReinforceConfig
 from train.distributed import average_gradients, processes, world_size
 from train.learner import Learner, check_folder, run
 from train.loss import EpisodicReinforceLoss, backward, decisions_with_advantage
+from train.remote import RayWorkers
 
 
 class Trainer(Learner):
@@ -29,13 +31,12 @@ class Trainer(Learner):
             self.baseline: Baseline = SharedBaseline(config.samples)
         else:
             self.baseline = RolloutBaseline(self.network, config, self.rng)
+        self.workers: RayWorkers | None = None
 
     def train_step(self) -> dict[str, float]:
         """One batch: play it, compare it with the baseline, one optimiser step. Returns what to log."""
         config, start = self.config, time.perf_counter()
-        drawn = draw(self.rng, config.at(self.step), config.batch_size, config.batch_tokens)
-        instances = repeat(drawn, config.samples)
-        episode = play(self.network, instances, config, "sample", keep=True)
+        instances, episode = self.collect()
         value = self.baseline.value(instances, episode.reward)
 
         advantage = episode.reward - value
@@ -52,7 +53,7 @@ class Trainer(Learner):
         self.schedule.step()
 
         self.step += 1
-        self.instances += len(drawn.nodes) * world_size()
+        self.instances += len(instances.nodes) // config.samples * world_size()
         logs = {
             "cost": -float(episode.reward.mean()),
             "baseline": -float(value.mean()),
@@ -63,6 +64,22 @@ class Trainer(Learner):
         if self.step % config.challenge_every == 0:
             logs["baseline_replaced"] = float(self.baseline.challenge(self.network))
         return logs
+
+    def collect(self) -> tuple[Instances, Episode]:
+        """Fresh instances, and the policy's episodes on them: played here, or by Ray workers."""
+        config = self.config
+        if config.collector == "ray":
+            self.workers = self.workers or RayWorkers(self.network, config, self.step)
+            return self.workers.collect()
+        drawn = draw(self.rng, config.at(self.step), config.batch_size, config.batch_tokens)
+        instances = repeat(drawn, config.samples)
+        return instances, play(self.network, instances, config, "sample", keep=True)
+
+    def close(self) -> None:
+        """End the Ray workers."""
+        if self.workers is not None:
+            self.workers.close()
+            self.workers = None
 
     def state_dict(self) -> dict[str, Any]:
         """Optimiser, schedule and baseline."""
@@ -86,6 +103,8 @@ def reinforce(config: ReinforceConfig) -> Trainer:
     """
     with processes(config.device):
         check_folder(config)
+        if config.collector == "ray" and world_size() > 1:
+            raise ValueError("collector must be 'here' under torchrun, got 'ray'")
         trainer = Trainer(config)
         run(trainer)
     return trainer
