@@ -1,4 +1,4 @@
-"""``python -m benchmarks {run,report,best,aims,speed}``."""
+"""``python -m benchmarks {run,report,best,aims,speed,ablations,curves}``."""
 
 from __future__ import annotations
 
@@ -170,6 +170,33 @@ def speed(
     from benchmarks import speed as module
 
     module.main(device, seconds)
+
+
+@app.command
+def ablations(minutes: float = 15.0, folder: Path = Path("runs/ablations"), seed: int = 0) -> None:
+    """Variants of DAN and of its training, each trained for the same time on one thread: results/ablations.md.
+
+    Args:
+        minutes: of each variant.
+        folder: of the runs; variants that have a verdict there are not trained again.
+        seed: of the training.
+    """
+    from benchmarks import ablations as module
+
+    module.main(minutes, folder, seed)
+
+
+@app.command
+def curves(minutes: float = 30.0, folder: Path = Path("runs/curves")) -> None:
+    """REINFORCE from scratch beside imitation, n = 20, m = 3: results/curves.csv and curves.png.
+
+    Args:
+        minutes: of each.
+        folder: of the runs, which are resumed.
+    """
+    from benchmarks import curves as module
+
+    module.main(minutes, folder)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from rich.progress import track
 from scipy.stats import sem
 
 from benchmarks import best
+from benchmarks.files import replace_text
 from benchmarks.run import describe_machine
 from benchmarks.suite import SEED, Cell
 from mtsp_env.instance import Instance, Tours, check_count
@@ -110,7 +110,7 @@ def main(
     table = markdown(found)
     print(table)
     head = f"{instances} uniform instances of each size, seed {seed}; one thread on {_machine()}."
-    _write(out, f"# The reference solver's aims\n\n{head}\n\n{table}\n\n{NOTE}\n")
+    replace_text(out, f"# The reference solver's aims\n\n{head}\n\n{table}\n\n{NOTE}\n")
 
 
 def search(cell: Cell, seed: int, seconds: float, workers: int, spent: Path, folder: Path) -> None:
@@ -126,7 +126,7 @@ def search(cell: Cell, seed: int, seconds: float, workers: int, spent: Path, fol
         for i, tours in track(pool.map(run, jobs), total=len(jobs), description=f"{cell.label}: long runs"):
             best.merge(cell, seed, {i: tours}, folder)
             done[i] = seconds
-            _write(spent, json.dumps({**_read(spent), f"{cell.label}-seed{seed}": done}))
+            replace_text(spent, json.dumps({**_read(spent), f"{cell.label}-seed{seed}": done}))
 
 
 def measure(aim: Aim, cell: Cell, seed: int, spent: Path, folder: Path) -> Measured:
@@ -193,14 +193,3 @@ def _spent(path: Path, cell: Cell, seed: int) -> list[float]:
 
 def _read(path: Path) -> dict[str, list[float]]:
     return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-
-
-def _write(path: Path, text: str) -> None:
-    """The whole file, or none of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -6,7 +6,6 @@ One file for each (set, size, seed): a list of one instance's tours a line, null
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
@@ -16,6 +15,7 @@ from pathlib import Path
 
 from rich.progress import track
 
+from benchmarks.files import replace_text
 from benchmarks.rows import Row
 from benchmarks.suite import TABLES, AnyCell, Cell, TsplibCell, find_cell
 from mtsp_env.instance import Instance, Tours
@@ -72,12 +72,8 @@ def merge(cell: AnyCell, seed: int, found: Mapping[int, Tours], folder: Path = F
             kept[i] = tours
             better += 1
     if better:
-        folder.mkdir(parents=True, exist_ok=True)
-        file = folder / cell.file(seed)
-        temporary = file.with_suffix(f".{os.getpid()}.tmp")
         lines = ",\n".join(json.dumps(kept.get(i), separators=(",", ":")) for i in range(max(kept) + 1))
-        temporary.write_text(f"[\n{lines}\n]\n", encoding="utf-8")
-        os.replace(temporary, file)
+        replace_text(folder / cell.file(seed), f"[\n{lines}\n]\n")
     return better
 
 

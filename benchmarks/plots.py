@@ -57,7 +57,7 @@ def gaps(results: Results, path: Path) -> None:
     figure.supxlabel("seconds per instance, one thread", fontsize=10)
     figure.supylabel("gap to the best known tours, %", fontsize=10)
     _legend(figure, axes.flat[: len(panels)])
-    _save(figure, path)
+    save(figure, path)
 
 
 def _title(results: Results, cell: AnyCell) -> str:
@@ -120,7 +120,7 @@ def planning_time(results: Results, path: Path) -> None:
     ax.set(xlabel="n, nodes (m = 5 agents)", ylabel="seconds per instance, one thread")
     _tidy(ax)
     _legend(figure, [ax])
-    _save(figure, path)
+    save(figure, path)
 
 
 def _style(method: str, results: Results) -> tuple[str, str]:
@@ -147,7 +147,8 @@ def _legend(figure: Figure, axes) -> None:
     figure.legend(handles.values(), handles.keys(), loc="outside right center", frameon=False, fontsize=9)
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save(figure: Figure, path: Path) -> None:
+    """The whole picture, or none of it."""
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     figure.savefig(temporary, dpi=130)
     os.replace(temporary, path)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from benchmarks import plots
+from benchmarks.files import replace_text
 from benchmarks.rows import Row
 from benchmarks.solvers.exact import PROVED
 from benchmarks.stats import Mean, Paired, Results, load, mean
@@ -58,10 +58,7 @@ def report(files: Sequence[Path], out: Path | None = None, tsplib: Path | None =
         draw = plots.planning_time if results.table == "figure4" else plots.gaps
         pictures[results.table] = f"{draw.__name__.replace('_', '-')}-{results.table}.png"
         draw(results, out / pictures[results.table])
-    page = out / "report.md"
-    temporary = page.with_name(f".report.{os.getpid()}.tmp")
-    temporary.write_text("\n".join(_lines(found, files, against, pictures)), encoding="utf-8")
-    os.replace(temporary, page)
+    replace_text(out / "report.md", "\n".join(_lines(found, files, against, pictures)))
     return "\n".join(str(out / name) for name in ["report.md", *pictures.values()])
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save as serialise
 from torch import nn
 
 from dan_policy.network import DAN, DANConfig
@@ -30,7 +30,7 @@ def save(path: str | os.PathLike, network: nn.Module, **extra: object) -> None:
     tensors = {key: value.detach().cpu().contiguous() for key, value in network.state_dict().items()}
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        save_file(tensors, temporary, metadata)
+        temporary.write_bytes(serialise(tensors, metadata))  # save_file's files are for their owner's eyes alone
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)

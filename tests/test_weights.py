@@ -29,13 +29,19 @@ def test_round_trip(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.safetensors"]  # no temporary file left
 
 
+def test_the_file_is_as_open_to_others_as_any(tmp_path):
+    (tmp_path / "any").write_bytes(b"")
+    save(tmp_path / "a.safetensors", DAN(SMALL))
+    assert (tmp_path / "a.safetensors").stat().st_mode == (tmp_path / "any").stat().st_mode
+
+
 def test_a_failed_save_keeps_the_old_file(file, monkeypatch):
     before = file.read_bytes()
 
     def disk_full(*_):
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(weights, "save_file", disk_full)
+    monkeypatch.setattr(weights.Path, "write_bytes", disk_full)
     with pytest.raises(OSError, match="no space"):
         save(file, DAN(SMALL))
     assert file.read_bytes() == before and len(list(file.parent.iterdir())) == 1

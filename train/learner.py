@@ -160,6 +160,8 @@ def run(learner: Learner) -> None:
                 if learner.step % config.validate_every == 0 and first:
                     logs["validation_cost"] = learner.validate()
                 learner.seconds += time.perf_counter() - start
+                if "validation_cost" in logs:
+                    logs["seconds"] = learner.seconds  # for curves over time, however often a run was interrupted
                 for logger in loggers:
                     for name, number in logs.items():
                         logger.log_scalar(name, number, step=learner.step)

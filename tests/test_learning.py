@@ -1,0 +1,112 @@
+"""Ablations and learning curves, on sizes that learn nothing in seconds: what is trained, judged, kept and resumed."""
+
+import csv
+import json
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks import ablations, best, curves
+from benchmarks.policies import nearest
+from benchmarks.suite import SEED, Cell
+from train.config import QUICK, REFINE, ImitateConfig
+
+CELL = Cell(50, 5, 3)
+
+
+@pytest.fixture
+def small(monkeypatch):
+    monkeypatch.setattr(ablations, "TRIAL", 0.1)
+    monkeypatch.setattr(ablations, "SAMPLES", 2)
+    monkeypatch.setattr(ablations, "CELLS", (CELL,))
+    monkeypatch.setattr(ablations, "SIZES", {"n_nodes": (6, 8), "n_agents": (2, 2), "nodes_per_agent": 2})
+    monkeypatch.setattr(ablations, "ImitateConfig", partial(ImitateConfig, set_tokens=64, buffer=4))
+    monkeypatch.setattr(ablations, "REFINE", replace(REFINE, batch_size=2, samples=2))
+    monkeypatch.setitem(curves.SIZE, "n_nodes", (6, 6))
+    monkeypatch.setitem(curves.SIZE, "n_agents", (2, 2))
+    monkeypatch.setitem(curves.SIZE, "validation_instances", 8)
+
+
+def test_gaps_are_to_the_best_known_tours():
+    class Nearest(torch.nn.Module):
+        def forward(self, cities, agents, visited):
+            return nearest.nearest(cities, agents, visited)
+
+    gaps = {decode: ablations.gaps(Nearest(), CELL, decode) for decode in ("greedy", "sample")}
+    known = best.read(CELL, SEED)
+    assert len(known) == len(gaps["greedy"]) == 3
+    assert all(gap > 0.05 for gap in gaps["greedy"])
+    assert all(gap > -1e-6 for gap in gaps["sample"])
+
+
+@pytest.mark.parametrize(
+    ("variant", "stages"),
+    [
+        (ablations.Variant("both", network={"city_layers": 1, "agent_layers": 0}), (True, True)),
+        (ablations.Variant("taught", warm=1.0, network={"city_layers": 1}), (True, False)),
+        (ablations.Variant("alone", warm=0.0, network={"city_layers": 1}), (False, True)),
+        (
+            ablations.Variant("other", warm=0.0, policy="benchmarks.policies.attention_model:AttentionModel"),
+            (False, True),
+        ),
+    ],
+)
+def test_a_variant_is_trained_in_its_stages(small, tmp_path, variant, stages):
+    found = ablations.train_and_judge(variant, 1.0, 0, tmp_path)
+    assert (found["imitation_steps"] > 0, found["reinforce_steps"] > 0) == stages
+    assert len(found["gaps"]["50x5"]["greedy"]) == len(found["gaps"]["50x5"]["sample"]) == 3
+    assert found["seconds"] > 0
+    weights = {"both": 825_088, "taught": 1_022_848, "alone": 1_022_848, "other": 710_272}
+    assert found["weights"] == weights[variant.name]
+
+
+def test_verdicts_are_kept_and_not_mixed(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(ablations, "VARIANTS", ablations.VARIANTS[:2])
+    gaps = {cell.label: {"greedy": [0.1, 0.3], "sample": [0.01, 0.03]} for cell in ablations.CELLS}
+    for number, variant in enumerate(ablations.VARIANTS):
+        told = {"minutes": 2.0, "seed": 0, "name": variant.name, "imitation_steps": 1234 * number}
+        found = {"reinforce_steps": 7, "seconds": 120.0, "weights": 1000, "gaps": gaps}
+        (tmp_path / f"{number}.json").write_text(json.dumps(told | found))
+    ablations.main(2.0, tmp_path, 0, tmp_path / "out" / "table.md")
+    table = (tmp_path / "out" / "table.md").read_text()
+    both = "| 20.0 ± 10.0 | 2.0 ± 1.0 "
+    assert f"| imitation alone {3 * both}| 1,234 | 7 | 1,000 |" in table.splitlines()
+    assert "python -m benchmarks ablations --minutes 2`" in table
+    with pytest.raises(ValueError, match="is of another run"):
+        ablations.main(3.0, tmp_path, 0, tmp_path / "table.md")
+    assert not (tmp_path / "table.md").exists()
+
+
+def test_curves_go_on_until_their_time_is_over(small, tmp_path, monkeypatch, capsys):
+    quick = replace(QUICK, batch_size=4, challenge_instances=4, validate_every=1)
+    monkeypatch.setattr(curves, "QUICK", quick)
+    taught = curves.imitate
+    monkeypatch.setattr(curves, "imitate", lambda config: taught(replace(config, validate_every=1, set_tokens=64)))
+    curves.main(0.02, tmp_path / "runs", tmp_path)
+    with (tmp_path / "curves.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    by_name = {name: [row for row in rows if row["method"] == name] for name in {row["method"] for row in rows}}
+    assert set(by_name) == {"REINFORCE from scratch", "imitation", "reference solver"}
+    teacher = float(by_name["reference solver"][0]["validation_cost"])
+    for name in ("REINFORCE from scratch", "imitation"):
+        seconds = [float(row["seconds"]) for row in by_name[name]]
+        assert seconds[-1] >= 1.2 and np.all(np.diff(seconds) > 0)
+        assert all(float(row["validation_cost"]) > teacher for row in by_name[name])
+    assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
+
+    before = (tmp_path / "curves.csv").read_text()
+    curves.main(0.02, tmp_path / "runs", tmp_path)  # nothing is left to train
+    assert (tmp_path / "curves.csv").read_text() == before
+    curves.main(0.04, tmp_path / "runs", tmp_path)
+    assert len((tmp_path / "curves.csv").read_text()) > len(before)
+
+
+@pytest.mark.parametrize("module", [ablations, curves])
+@pytest.mark.parametrize("minutes", [0.0, -1.0, float("nan")])
+def test_no_time_is_refused(module, minutes, tmp_path):
+    with pytest.raises(ValueError, match="minutes must be above 0"):
+        module.main(minutes, tmp_path / "runs")
+    assert not (tmp_path / "runs").exists()
