@@ -16,7 +16,7 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 
 from mtsp_env.instance import DISTRIBUTIONS, Instance, Tours, read_instance, sample_nodes, write_instance, write_tours
-from mtsp_env.render import check_suffix, format_lengths, save_picture
+from mtsp_env.render import check_suffix, save_picture
 from mtsp_env.tours import lower_bound, tour_lengths
 from mtsp_env.tsplib import read_tsplib
 from mtsp_env.version import __version__
@@ -63,16 +63,15 @@ def _solve(args: argparse.Namespace) -> None:
     plots, outs = _outputs(args.plot, instances), _outputs(args.out, instances)
     _check_outputs(args.files, plots, outs)
     solve = {"dan": _dan, "reference": _reference}[args.method](args)
-    if not args.json:
-        _check_table()
+    show = None if args.json else _table()
 
     for instance, plot, out in zip(instances, plots, outs, strict=True):
         plan = solve(instance)
         record = _record(instance, plan)
-        if args.json:
+        if show is None:
             print(json.dumps(record), flush=True)
         else:
-            _print_table(record)
+            show(record)
         if out is not None:
             with _writing(out, quiet=args.json):
                 write_tours(out, **record)
@@ -125,11 +124,12 @@ def _reference(args: argparse.Namespace) -> Callable[[Instance], Plan]:
     return plan
 
 
-def _check_table() -> None:
+def _table() -> Callable[[dict], None]:
     try:
-        import rich  # noqa: F401
+        from dan_policy.table import print_table
     except ImportError as error:
         raise ImportError(f'the table needs rich ({error}): pip install "mtsp-env[dan]", or add --json') from error
+    return print_table
 
 
 def _read(path: Path, n_agents: int | None) -> Instance:
@@ -183,53 +183,6 @@ def _record(instance: Instance, plan: Plan) -> dict:
         "lengths": lengths.tolist(),
         "tours": [[int(node) for node in tour] for tour in plan.tours],
     }
-
-
-def _print_table(record: dict) -> None:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    console = Console(highlight=False)
-    *lengths, bound = format_lengths([*record["lengths"], record["lower_bound"]])
-    makespan, longest = record["makespan"], int(np.argmax(record["lengths"]))
-
-    table = Table(box=box.SIMPLE, title_justify="left", title_style="bold")
-    table.title = Text(f"{record['name'] or 'mTSP'}: {record['n_nodes'] - 1} cities, {record['n_agents']} agents")
-    for heading in ("agent", "cities", "length", "share"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("tour (0: the depot, the file's first node)", no_wrap=True)
-    width = console.width - 15 - sum(max(7, len(length)) for length in [max(lengths, key=len)] * 4)
-    for agent, tour in enumerate(record["tours"]):
-        share = f"{record['lengths'][agent] / makespan:.0%}" if makespan else ""
-        cities = str(sum(node != 0 for node in tour))
-        style = "bold" if agent == longest and makespan else None
-        table.add_row(str(agent), cities, lengths[agent], share, _elide(tour, width), style=style)
-    console.print(table)
-
-    console.print(Text(f"makespan {lengths[longest]}; {_compare(makespan, record['lower_bound'], bound)}"))
-    console.print(Text(f"{record['method']} in {record['seconds']:.3g} s"))
-
-
-def _compare(makespan: float, lower_bound: float, written: str) -> str:
-    gap = makespan / lower_bound - 1 if lower_bound else 0.0
-    return f"at most {gap:.1%} above the best possible (lower bound {written})" if gap > 1e-9 else "the best possible"
-
-
-def _elide(tour: Sequence[int], width: int) -> str:
-    """A tour in at most ``width`` characters where that is possible: its beginning, its end, dots between."""
-    whole = " ".join(map(str, tour))
-    if len(whole) <= width:
-        return whole
-    shown = min(len(tour) - 1, width // 2)
-    while True:
-        end = max(2, shown // 3)
-        begin = max(2, shown - end)
-        text = " ".join([*map(str, tour[:begin]), "...", *map(str, tour[-end:])])
-        if len(text) <= width or shown <= 4:
-            return text
-        shown -= 1
 
 
 # mtsp generate

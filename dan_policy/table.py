@@ -1,0 +1,60 @@
+"""A plan on the terminal, for ``mtsp solve``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from mtsp_env.render import format_lengths
+
+
+def print_table(record: dict) -> None:
+    """Agents and their tours, the longest in bold, as wide as the terminal; then the makespan beside its lower bound.
+
+    Args:
+        record: what ``mtsp solve --json`` prints.
+    """
+    console = Console(highlight=False)
+    *lengths, bound = format_lengths([*record["lengths"], record["lower_bound"]])
+    makespan, longest = record["makespan"], int(np.argmax(record["lengths"]))
+
+    table = Table(box=box.SIMPLE, title_justify="left", title_style="bold")
+    table.title = Text(f"{record['name'] or 'mTSP'}: {record['n_nodes'] - 1} cities, {record['n_agents']} agents")
+    for heading in ("agent", "cities", "length", "share"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("tour (0: the depot, the file's first node)", no_wrap=True)
+    width = console.width - 15 - sum(max(7, len(length)) for length in [max(lengths, key=len)] * 4)
+    for agent, tour in enumerate(record["tours"]):
+        share = f"{record['lengths'][agent] / makespan:.0%}" if makespan else ""
+        cities = str(sum(node != 0 for node in tour))
+        style = "bold" if agent == longest and makespan else None
+        table.add_row(str(agent), cities, lengths[agent], share, _elide(tour, width), style=style)
+    console.print(table)
+
+    console.print(Text(f"makespan {lengths[longest]}; {_compare(makespan, record['lower_bound'], bound)}"))
+    console.print(Text(f"{record['method']} in {record['seconds']:.3g} s"))
+
+
+def _compare(makespan: float, lower_bound: float, written: str) -> str:
+    gap = makespan / lower_bound - 1 if lower_bound else 0.0
+    return f"at most {gap:.1%} above the best possible (lower bound {written})" if gap > 1e-9 else "the best possible"
+
+
+def _elide(tour: Sequence[int], width: int) -> str:
+    """A tour in at most ``width`` characters where that is possible: its beginning, its end, dots between."""
+    whole = " ".join(map(str, tour))
+    if len(whole) <= width:
+        return whole
+    shown = min(len(tour) - 1, width // 2)
+    while True:
+        end = max(2, shown // 3)
+        begin = max(2, shown - end)
+        text = " ".join([*map(str, tour[:begin]), "...", *map(str, tour[-end:])])
+        if len(text) <= width or shown <= 4:
+            return text
+        shown -= 1
