@@ -152,6 +152,7 @@ def speed(
     device: str = "cpu",
     seconds: float = 3.0,
     train: bool = False,
+    solve: bool = False,
     precision: Literal["float32", "bfloat16"] = "float32",
 ) -> None:
     """Decisions and instances per second of environments, networks and trainer on this machine.
@@ -160,8 +161,14 @@ def speed(
         device: cpu or cuda.
         seconds: of measuring, for each row.
         train: rollouts, imitation and REINFORCE at n = 20, 50, 100 and 200 instead, with their share of the FLOP rate.
+        solve: time and memory of plans with the shipped model on the CPU instead.
         precision: of `train`.
     """
+    if solve:
+        from benchmarks import speed_solve
+
+        speed_solve.main()
+        return
     if train:
         from benchmarks import speed_train
 

@@ -12,7 +12,7 @@ import pytest
 from made_up import one_agent_does_it_all, row
 from misbehaving import deals
 
-from benchmarks import best, rows, solvers, speed, speed_train, suite
+from benchmarks import best, rows, solvers, speed, speed_solve, speed_train, suite
 from benchmarks.__main__ import main
 from benchmarks.suite import SEED, TABLES, Cell, TsplibCell
 from dan_policy import DAN, DANConfig
@@ -183,6 +183,14 @@ def test_speed_is_work_over_time(monkeypatch):
     clock = iter([0.0, 1.0, 2.0, 4.0])
     monkeypatch.setattr(speed.time, "perf_counter", lambda: next(clock))
     assert speed.per_second(lambda: 6, seconds=3.0) == 6 * 2 / 4  # two rounds end before 3 s, after 4 s it looks
+
+
+def test_plans_are_timed_and_their_memory_is_measured(monkeypatch):
+    monkeypatch.setattr(speed_solve.torch, "set_num_threads", lambda threads: None)  # this process goes on
+    before = speed_solve.peak_memory()
+    found = speed_solve.measure(speed_solve.Plan(30, 2, "greedy"), threads=1, repeats=2)
+    assert found.first > 0 and found.later > 0
+    assert 10 * 2**20 < before <= found.before <= found.peak == speed_solve.peak_memory() < 100 * 2**30
 
 
 def test_every_speed_is_measured():
