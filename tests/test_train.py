@@ -328,6 +328,8 @@ def test_a_network_of_ones_own_is_trained_saved_and_continued(tmp_path):
 
 def test_presets_follow_the_paper():
     assert (PAPER.n_nodes, PAPER.n_agents, PAPER.speed, PAPER.batch_size) == ((20, 100), (5, 10), 0.1, 8)
+    late = PAPER.at(4 * PAPER.steps // 5)  # the last 24 of 120 hours
+    assert PAPER.at(4 * PAPER.steps // 5 - 1) is PAPER and (late.n_nodes, late.n_agents) == ((20, 200), (5, 10))
     assert (PAPER.learning_rate, PAPER.decay, PAPER.decay_every, PAPER.depot) == (1e-5, 0.96, 1024, "open")
 
 

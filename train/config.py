@@ -252,11 +252,15 @@ def check_same_run(old: dict, config: RunConfig) -> None:
         raise ValueError(f"a resumed run keeps its configuration: {said}")
 
 
-PAPER = ReinforceConfig()
-"""The paper's training, stage 1 (Sec. 5.1), with one optimiser step per batch instead of one per agent."""
+PAPER = ReinforceConfig(curriculum=((80_000, 20, 200, 5, 10),))
+"""The paper's training (Sec. 5.1), with one optimiser step per batch instead of one per agent.
+
+The last fifth of the steps is on up to 200 nodes, as the last 24 of the paper's 120 hours were.
+"""
 
 QUICK = replace(
     PAPER,
+    curriculum=(),
     steps=2_000,
     n_nodes=(10, 30),
     n_agents=(2, 5),
@@ -276,6 +280,7 @@ QUICK = replace(
 
 REFINE = replace(
     PAPER,
+    curriculum=(),
     steps=1_000,
     n_nodes=(20, 100),
     n_agents=(2, 10),
@@ -296,7 +301,7 @@ REFINE = replace(
 """From imitated weights (``init``): many samples of few instances, each other's baseline."""
 
 PRESETS = {
-    "paper": ("the paper's setting: n in [20, 100], m in [5, 10], 8 instances a step, Adam 1e-5", PAPER),
+    "paper": ("the paper's: n in [20, 100], later up to 200, m in [5, 10], 8 instances a step, Adam 1e-5", PAPER),
     "refine": ("sharpens imitated weights (--init): 8 samples of each instance, each other's baseline", REFINE),
     "quick": ("n in [10, 30], m in [2, 5], 128 instances a step: learns within minutes on a CPU", QUICK),
 }
