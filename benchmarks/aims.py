@@ -109,7 +109,10 @@ def main(
     found = [measure(aim, aim.cell(instances), seed, spent, folder) for aim in aims]
     table = markdown(found)
     print(table)
-    head = f"{instances} uniform instances of each size, seed {seed}; one thread on {_machine()}."
+    head = (
+        f"{instances} uniform instances of each size, seed {seed}; one thread on {_machine()}. "
+        f"Made by `python -m benchmarks aims --instances {instances}` after long runs (`--best-seconds`)."
+    )
     replace_text(out, f"# The reference solver's aims\n\n{head}\n\n{table}\n\n{NOTE}\n")
 
 
