@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from rich.progress import track
 
+from benchmarks.files import replace_text
 from benchmarks.solvers import SOLVERS, exact, lkh3, reference
 from benchmarks.suite import SEED, Cell
 from mtsp_env.instance import Instance, check_count
@@ -154,10 +154,5 @@ All of this holds for {held}.
 {markdown(rows)}
 """
     print(text)
-    temporary = out.with_name(f".{out.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, out)
-    finally:
-        temporary.unlink(missing_ok=True)
+    replace_text(out, text)
     return int(not all(row.holds for row in rows))
