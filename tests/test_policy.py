@@ -215,6 +215,17 @@ def test_bfloat16_is_for_hardware_and_sizes_that_gain(monkeypatch, kwargs, n_nod
     assert seen == {expected and (hardware or "precision" in kwargs)}
 
 
+@pytest.mark.parametrize(
+    ("capabilities", "expected"), [({"amx_bf16": True}, True), ({"amx_bf16": False}, False), ({}, False)]
+)
+def test_matrix_units_are_what_the_cpu_says(monkeypatch, capabilities, expected):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities, raising=False)
+    asked = solution._multiplies_bfloat16.__wrapped__  # what it said of this machine stays cached
+    assert asked(torch.device("cpu")) is expected
+    monkeypatch.delattr(torch.cpu, "get_capabilities")
+    assert asked(torch.device("cpu")) is False  # an older torch does not say
+
+
 def test_other_policies_keep_their_precision(monkeypatch):
     monkeypatch.setattr(solution, "_multiplies_bfloat16", lambda device: True)
 

@@ -62,7 +62,6 @@ class RayWorkers:
             if self.started:
                 ray.shutdown()
             raise
-        self.workers.update_policy_weights_()
         self.batches = iter(self.workers)
 
     def collect(self) -> tuple[Instances, Episode]:
