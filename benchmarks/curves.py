@@ -14,10 +14,11 @@ from benchmarks.plots import save
 from benchmarks.run import describe_machine
 from mtsp_env.reference import improve_batch
 from mtsp_env.tours import makespan
+from train import checkpoint
 from train.collect import draw_set
 from train.config import QUICK, ImitateConfig, RunConfig
 from train.imitate import imitate
-from train.learner import VALIDATION_SEED
+from train.learner import VALIDATION_SEED, checkpoint_path
 from train.reinforce import reinforce
 
 RESULTS = Path(__file__).parent / "results"
@@ -45,7 +46,7 @@ def main(minutes: float = 30.0, folder: Path = Path("runs/curves"), out: Path = 
     curves = {}
     for name, (train, config) in runs.items():
         begun = config.out.exists()
-        left = 60 * minutes - (read(config.out)[-1][1] if begun else 0.0)
+        left = 60 * minutes - (checkpoint.read(checkpoint_path(config))["progress"]["seconds"] if begun else 0.0)
         if left > 0:
             train(replace(config, seconds=left, resume=begun))
         curves[name] = read(config.out)

@@ -40,7 +40,7 @@ class RunConfig:
     steps: int = 100_000
     """Optimiser steps in all."""
     seconds: float | None = None
-    """Stop (and save) after so many seconds of this process, whatever `steps` says."""
+    """Stop (and save) after so many more seconds of training and validation, whatever `steps` says."""
 
     n_nodes: tuple[int, int] = (20, 100)
     """Range of n, the depot included; drawn once per batch."""

@@ -145,7 +145,7 @@ def run(learner: Learner) -> None:
     loggers = [CSVLogger("logs", str(config.out))] if first else []
     if config.tensorboard and first:
         loggers.append(TensorboardLogger("tensorboard", str(config.out)))
-    stop_at = time.monotonic() + (config.seconds or math.inf)
+    stop_at = learner.seconds + (config.seconds or math.inf)  # on the clock that is logged and kept
     every = 0.5 if sys.stderr.isatty() else 60.0  # a log file wants few lines
     bar = tqdm(
         total=config.steps, initial=learner.step, unit="step", dynamic_ncols=True, mininterval=every, disable=not first
@@ -153,7 +153,7 @@ def run(learner: Learner) -> None:
     with bar, _interrupts() as interrupted:
         try:
             while learner.step < config.steps:
-                if anyone(bool(interrupted) or time.monotonic() >= stop_at, config.device):
+                if anyone(bool(interrupted) or learner.seconds >= stop_at, config.device):
                     break
                 start = time.perf_counter()
                 logs = learner.train_step()
