@@ -224,16 +224,32 @@ def test_drawn_sizes_cover_their_ranges():
     assert sum(len(part.nodes) for part in draw_set(rng, TINY, 21)) == 21
 
 
-def test_resume_is_bit_identical(tmp_path):
-    reinforce(replace(TINY, out=tmp_path / "whole"))
-    reinforce(replace(TINY, out=tmp_path / "parts", steps=3))
+@pytest.mark.parametrize("average", [0.0, 0.9])
+def test_resume_is_bit_identical(tmp_path, average):
+    config = replace(TINY, average=average)
+    reinforce(replace(config, out=tmp_path / "whole"))
+    reinforce(replace(config, out=tmp_path / "parts", steps=3))
     torch.manual_seed(123)  # whatever happened in between
-    reinforce(replace(TINY, out=tmp_path / "parts", resume=True))
+    reinforce(replace(config, out=tmp_path / "parts", resume=True))
     whole, parts = (checkpoint.read(tmp_path / name / "checkpoint.pt") for name in ("whole", "parts"))
-    for key in ("network", "optimiser", "schedule", "baseline", "random"):
+    for key in ("network", "average", "optimiser", "schedule", "baseline", "random"):
         assert same(whole[key], parts[key]), key
     for key in ("step", "instances", "best"):
         assert whole["progress"][key] == parts["progress"][key], key
+
+
+def test_the_policy_is_the_running_average_of_the_weights(tmp_path):
+    plain, averaged = (Trainer(replace(TINY, out=tmp_path / str(decay), average=decay)) for decay in (0.0, 0.75))
+    expected: dict[str, torch.Tensor] = {}
+    for _ in range(3):
+        plain.train_step()
+        averaged.train_step()
+        for name, weight in averaged.network.state_dict().items():
+            expected[name] = 0.75 * expected.get(name, weight) + 0.25 * weight
+    assert same(dict(plain.policy().state_dict()), dict(plain.network.state_dict()))
+    kept = averaged.policy().state_dict()
+    assert max(float((kept[name] - weight).abs().max()) for name, weight in expected.items()) < 1e-6
+    assert not same(dict(kept), dict(averaged.network.state_dict()))
 
 
 def test_an_interrupt_finishes_the_step_and_saves(tmp_path, monkeypatch):

@@ -60,6 +60,8 @@ class RunConfig:
     init: str | None = None
     """Weights to start from: a file, or the name of a shipped model (its configuration replaces `network`)."""
     max_grad_norm: float = 1.0
+    average: float = 0.0
+    """Decay of the running average of the weights, which is what is validated and saved. 0: the weights as they are."""
 
     validation_instances: int = 256
     """Held-out instances (the same in every run) for the reported cost and for `best.safetensors`."""
@@ -82,6 +84,8 @@ class RunConfig:
         self._check_at_least(1, "steps", "nodes_per_agent", "validate_every", "checkpoint_every")
         self._check_at_least(2, "validation_instances")
         self._check_positive("max_grad_norm", "speed")
+        if not 0 <= self.average < 1:
+            raise ValueError(f"average must be at least 0 and below 1, got {self.average!r}")
         if self.n_agents[0] * self.nodes_per_agent > self.n_nodes[0]:
             raise ValueError(
                 f"nodes_per_agent must be at most n_nodes[0] // n_agents[0] = {self.n_nodes[0] // self.n_agents[0]}, "
@@ -218,7 +222,6 @@ class ImitateConfig(RunConfig):
     weight_decay: float = 0.01
     """AdamW's."""
     average: float = 0.999
-    """Decay of the running average of the weights, which is what is validated and saved."""
     validate_every: int = 500
     checkpoint_every: int = 500
 
@@ -237,8 +240,6 @@ class ImitateConfig(RunConfig):
             raise ValueError(f"passes must be above 0 and at most 1, got {self.passes!r}")
         if not 0 < self.final_rate <= 1:
             raise ValueError(f"final_rate must be above 0 and at most 1, got {self.final_rate!r}")
-        if not 0 <= self.average < 1:
-            raise ValueError(f"average must be at least 0 and below 1, got {self.average!r}")
         if not self.weight_decay >= 0:
             raise ValueError(f"weight_decay must be at least 0, got {self.weight_decay!r}")
 

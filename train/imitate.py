@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor, nn
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch import Tensor
 
 from dan_policy.actor import make_actor
 from train.collect import autocast
@@ -31,7 +30,6 @@ class Imitator(Learner):
 
     def __init__(self, config: ImitateConfig):
         super().__init__(config)
-        self.average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(config.average))
         self.optimiser = torch.optim.AdamW(
             self.network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
         )
@@ -69,18 +67,14 @@ class Imitator(Learner):
             "waited": waited,
         }
 
-    def policy(self) -> nn.Module:
-        """The running average of the weights."""
-        return self.average.module
-
     def state_dict(self) -> dict[str, Any]:
-        """Average, optimiser, schedule, and where the buffer stands."""
-        parts = ("average", "optimiser", "schedule", "buffer")
+        """Optimiser, schedule, and where the buffer stands."""
+        parts = ("optimiser", "schedule", "buffer")
         return {part: getattr(self, part).state_dict() for part in parts}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what ``state_dict`` returned."""
-        for part in ("average", "optimiser", "schedule", "buffer"):
+        for part in ("optimiser", "schedule", "buffer"):
             getattr(self, part).load_state_dict(state[part])
 
     def close(self) -> None:

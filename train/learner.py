@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import nn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.record import CSVLogger, TensorboardLogger
 from tqdm import tqdm
 
@@ -43,6 +44,7 @@ class Learner(ABC):
         if world_size() > 1:  # the same network everywhere, then everybody's own instances and actions
             torch.manual_seed(config.seed + rank())
             self.rng = np.random.default_rng([config.seed, rank()])
+        self.average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(config.average))
         held_out = np.random.default_rng(VALIDATION_SEED)
         self.validation_set = draw_set(held_out, config, config.validation_instances)
         self.step, self.instances, self.seconds, self.best = 0, 0, 0.0, math.inf
@@ -65,8 +67,8 @@ class Learner(ABC):
         return checkpoint_path(self.config)
 
     def policy(self) -> nn.Module:
-        """The network to validate and to keep."""
-        return self.network
+        """The network to validate and to keep: the running average of the weights."""
+        return self.average.module
 
     def close(self) -> None:  # noqa: B027 (most have nothing to do)
         """Let go of other processes."""
@@ -91,6 +93,7 @@ class Learner(ABC):
         state = {
             "config": self.config.to_dict(),
             "network": self.network.state_dict(),
+            "average": self.average.state_dict(),
             "random": checkpoint.random_state(self.rng),
             "progress": progress,
         }
@@ -103,6 +106,7 @@ class Learner(ABC):
         state = checkpoint.read(self.checkpoint)
         check_same_run(state["config"], self.config)
         self.network.load_state_dict(state["network"])
+        self.average.load_state_dict(state["average"])
         self.load_state_dict(state)
         for name, value in state["progress"].items():
             setattr(self, name, value)

@@ -51,6 +51,7 @@ class Trainer(Learner):
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.max_grad_norm)
         self.optimiser.step()
         self.schedule.step()
+        self.average.update_parameters(self.network)
 
         self.step += 1
         self.instances += len(instances.nodes) // config.samples * world_size()
@@ -62,7 +63,7 @@ class Trainer(Learner):
             "episodes_per_second": len(advantage) * world_size() / (time.perf_counter() - start),
         }
         if self.step % config.challenge_every == 0:
-            logs["baseline_replaced"] = float(self.baseline.challenge(self.network))
+            logs["baseline_replaced"] = float(self.baseline.challenge(self.policy()))
         return logs
 
     def collect(self) -> tuple[Instances, Episode]:
