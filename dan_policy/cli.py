@@ -22,7 +22,7 @@ from mtsp_env.tsplib import read_tsplib
 from mtsp_env.version import __version__
 
 METHODS = {  # each with the options that are its own
-    "dan": ("policy", "decode", "samples", "device", "precision", "improve"),
+    "dan": ("policy", "decode", "samples", "augment", "device", "precision", "improve"),
     "reference": ("seconds",),
 }
 DEFAULT_SAMPLES = 64  # the paper's DAN(s.64)
@@ -105,6 +105,7 @@ def _dan(args: argparse.Namespace) -> Callable[[Instance], Plan]:
             device=args.device or "cpu",
             improve=args.improve,
             precision=args.precision or "auto",
+            augment=args.augment or False,
         )
         return Plan(solution.tours, solution.seconds, solution.method)
 
@@ -267,6 +268,12 @@ def _parser() -> argparse.ArgumentParser:
         help="--method dan: likeliest actions once, or the best of --samples draws (default: greedy)",
     )
     option("--samples", type=_whole(1), metavar="K", help=f"with --decode sample (default: {DEFAULT_SAMPLES})")
+    option(
+        "--augment",
+        action="store_const",
+        const=True,
+        help="--method dan: play in the square's eight symmetries and take the best (greedy: eight games, not one)",
+    )
     option("--device", help="--method dan: cpu, cuda, cuda:1, ... (default: cpu)")
     option(
         "--precision",

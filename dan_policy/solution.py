@@ -5,17 +5,19 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 from typing import Literal, get_args
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from dan_policy.actor import make_actor
 from dan_policy.episode import Decode, find_device, rollout
 from dan_policy.network import DAN
+from dan_policy.symmetry import SYMMETRIES, views
 from dan_policy.weights import find, load
 from mtsp_env import rules
 from mtsp_env.batched import BatchedMTSP
@@ -24,7 +26,7 @@ from mtsp_env.tours import check_tours, makespan
 
 Precision = Literal["auto", "float32", "bfloat16"]
 SPEED = 0.01  # the paper's Delta g in tests (Sec. 6)
-SHARP_FROM, SHARP_CLIP = 500, 100.0  # the paper samples with C = 100 from n = 500 on (Sec. 6.1)
+SHARP_CLIP = 100.0
 ENOUGH = 500  # nodes side by side from which bfloat16 pays on a CPU that multiplies such matrices
 
 
@@ -36,7 +38,7 @@ class Solution:
         tours: one per agent, each from depot to depot.
         makespan: the longest tour, in unit-square units; times ``instance.scale`` it is in the source's.
         seconds: wall-clock time of the planning, improvement included, without loading weights or compiling kernels.
-        method: for tables, e.g. "dan(g.)", "dan(s.64)" or "dan(g.)+improve(1 s)".
+        method: for tables, e.g. "dan(g.)", "dan(s.64)", "dan(g.x8)" (augmented) or "dan(g.)+improve(1 s)".
     """
 
     tours: Tours
@@ -54,6 +56,7 @@ def solve(
     device: torch.device | str | None = None,
     improve: float | None = None,
     precision: Precision = "auto",
+    augment: bool = False,
 ) -> Solution:
     """Plan the team's tours with a policy (paper, Sec. 6: DAN(g.) and DAN(s.64)), and polish them where asked to.
 
@@ -62,7 +65,8 @@ def solve(
     Args:
         policy: the name of a shipped model, a file that ``dan_policy.save`` wrote, a ``DAN``, or any actor built by
             ``make_actor``.
-        decode: "greedy": one game of likeliest actions. "sample": ``samples`` games of drawn ones, the best counts.
+        decode: "greedy": one game of likeliest actions. "sample": ``samples`` games of drawn ones, the best counts;
+            of a DAN with the C of ``sample_clip``.
         samples: games played side by side where ``decode`` is "sample", at least 1.
         seed: of the samples and of the improvement; without the latter, which goes by the clock, the same call gives
             the same tours on the same machine.
@@ -72,6 +76,8 @@ def solve(
         precision: of the network's matrix products. "auto": "bfloat16" where the device has units for it and the games
             hold enough nodes to gain (twice as fast for 64 samples on a CPU with AMX, equally good tours), for a DAN;
             "float32" elsewhere, and for tours that do not depend on the device.
+        augment: the games see the instance in the square's eight symmetries in turn, and the best counts (Kwon et al.
+            2020, POMO): "greedy" plays eight games instead of one, "sample" as many as without.
 
     Raises:
         ImportError: ``improve`` without Numba.
@@ -85,26 +91,29 @@ def solve(
         raise ValueError(f"unknown precision {precision!r}; choose from {list(get_args(Precision))}")
     polish = None if improve is None else _polish(improve, seed)
     device = find_device(device)
-    sharp = decode == "sample" and instance.n_nodes >= SHARP_FROM
-    policy = _ready(policy, device, sharp)
+    policy = _ready(policy, device)
+    if decode == "sample" and isinstance(policy, DAN):
+        policy = _sharpened(policy, sample_clip(policy.config.tanh_clip, instance.n_nodes, augment))
 
-    rows = samples if decode == "sample" else 1
+    rows = samples if decode == "sample" else SYMMETRIES if augment else 1
     if precision == "auto":
         gains = isinstance(policy, DAN) and _multiplies_bfloat16(device) and rows * instance.n_nodes >= ENOUGH
         precision = "bfloat16" if gains else "float32"
 
     start = time.perf_counter()
     with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"):
-        if decode == "greedy" and isinstance(policy, DAN) and device.type == "cpu":
+        if rows == 1 and decode == "greedy" and isinstance(policy, DAN) and device.type == "cpu":
             tours = _play_alone(policy, instance)
         else:
-            tours = _play(policy, instance, decode, rows, seed, device)
+            nodes = torch.as_tensor(instance.nodes.copy(), device=device)
+            nodes = views(nodes, rows) if augment else nodes.expand(rows, -1, -1)
+            tours = _play(policy, nodes, instance.n_agents, decode, seed)
     if polish is not None:
         tours = polish(instance, tours)
     seconds = time.perf_counter() - start
 
     check_tours(instance, tours)
-    method = "dan(g.)" if decode == "greedy" else f"dan(s.{samples})"
+    method = f"dan({'g.' if decode == 'greedy' else f's.{samples}'}{'x8' if augment else ''})"
     if polish is not None:
         method += f"+improve({improve:g} s)"
     return Solution(tours, makespan(instance.nodes, tours), seconds, method)
@@ -128,13 +137,11 @@ def _polish(seconds: float, seed: int) -> Callable[[Instance, Tours], Tours]:
     return partial(reference.improve, seconds=seconds, seed=seed)
 
 
-def _play(policy: nn.Module, instance: Instance, decode: Decode, rows: int, seed: int, device: torch.device) -> Tours:
-    """The best of ``rows`` games, side by side."""
+def _play(policy: nn.Module, nodes: Tensor, n_agents: int, decode: Decode, seed: int) -> Tours:
+    """The best game on ``nodes`` (rows, n, 2), which are all the same instance: side by side."""
     actor = make_actor(policy) if isinstance(policy, DAN) else policy
-    env = BatchedMTSP(
-        instance.n_nodes, instance.n_agents, [rows], SPEED, depot="final", device=device, check_actions=False
-    )
-    nodes = torch.as_tensor(instance.nodes.copy(), device=device).expand(rows, -1, -1)
+    rows, n_nodes, device = *nodes.shape[:2], nodes.device
+    env = BatchedMTSP(n_nodes, n_agents, [rows], SPEED, depot="final", device=device, check_actions=False)
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
         torch.manual_seed(seed)
         last = rollout(actor, env, decode, nodes).last
@@ -154,18 +161,29 @@ def _play_alone(network: DAN, instance: Instance) -> Tours:
     return rules.tours(state.visits[0], state.destination[0])
 
 
-def _ready(policy: str | os.PathLike | nn.Module, device: torch.device, sharp: bool) -> nn.Module:
+def _ready(policy: str | os.PathLike | nn.Module, device: torch.device) -> nn.Module:
     """A DAN, or an actor, on its device."""
     if not isinstance(policy, nn.Module):
         file = find(policy)
         policy = _loaded(file, file.stat().st_mtime_ns, device)
-    if not isinstance(policy, DAN):
-        return policy.to(device)
-    if sharp:
-        clipped = DAN(replace(policy.config, tanh_clip=SHARP_CLIP))
-        clipped.load_state_dict(policy.state_dict())
-        policy = clipped
-    return policy.to(device).eval()
+    return policy.to(device).eval() if isinstance(policy, DAN) else policy.to(device)
+
+
+def sample_clip(clip: float, n_nodes: int, augment: bool = False) -> float:
+    """C to sample with, for a policy trained with C = ``clip``: larger logits for longer games.
+
+    The more decisions a game has, the surer each must be for a whole sample to be good. The paper keeps its C = 10 for
+    small instances and takes 100 from n = 500 on (Sec. 6.1); here C grows with n between these two, n / 5. Augmented
+    games differ without chance, too: they are three times as sure.
+    """
+    return max(clip, min(SHARP_CLIP, clip * n_nodes / 50 * (3 if augment else 1)))
+
+
+def _sharpened(network: DAN, clip: float) -> DAN:
+    """The same weights with another C, which scales the logits."""
+    sharper = copy(network)  # shares the parameters
+    sharper.config = replace(network.config, tanh_clip=clip)
+    return sharper
 
 
 @lru_cache(maxsize=4)

@@ -142,7 +142,9 @@ def test_the_command_takes_better_tours_and_verifies(tmp_path, monkeypatch, caps
 # Solvers
 
 
-@pytest.mark.parametrize("name", ["random", "nearest", "dan-greedy", "dan-s64", "dan-improve", "reference"])
+@pytest.mark.parametrize(
+    "name", ["random", "nearest", "dan-greedy", "dan-greedy-x8", "dan-s64-x8", "dan-improve", "reference"]
+)
 def test_our_solvers_solve_tiny_instances_and_repeat_themselves(name):
     for instance in [*CELL.instances(0), *Cell(3, 5, 1).instances(0)]:
         tours = solvers.find(name)(instance, 0.05, 0)
@@ -165,7 +167,7 @@ def test_solvers_are_found_by_name(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     assert solvers.find("misbehaving:deals") is deals
     assert solvers.look_up("dan-s64").options == {"samples": 64}
-    dan = ["dan-greedy", "dan-s64", "dan-s256", "dan-improve"]
+    dan = ["dan-greedy", "dan-greedy-x8", "dan-s64", "dan-s64-x8", "dan-s256", "dan-improve"]
     assert solvers.expand(["nearest, dan", "dan-s64"]) == ["nearest", *dan]
     assert solvers.expand(["all"]) == list(solvers.SOLVERS)
     with pytest.raises(ValueError, match="unknown solver 'magic'; choose from"):

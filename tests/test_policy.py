@@ -120,6 +120,28 @@ def test_more_samples_are_never_worse_than_the_first_of_them(network):
     assert max(costs) < np.mean(singles)
 
 
+def test_augmented_plans_are_the_best_of_the_eight_views(network):
+    instance = uniform(np.random.default_rng(7), 14, 3)
+    centred = [instance.nodes - 0.5, (instance.nodes - 0.5) * [-1, 1]]
+    turned = [part @ np.linalg.matrix_power([[0, -1], [1, 0]], k) + 0.5 for part in centred for k in range(4)]
+    alone = [solve(Instance(nodes, 3), network).makespan for nodes in turned]
+    best = solve(instance, network, augment=True)
+    assert best.makespan == pytest.approx(min(alone), abs=1e-9) and len({round(cost, 6) for cost in alone}) > 1
+    assert best.method == "dan(g.x8)"
+    check_tours(instance, best.tours)
+
+    seen = []
+
+    def uniform_logits(cities, visited):
+        seen.append(cities)
+        return torch.zeros(visited.shape)
+
+    drawn = solve(instance, make_actor(uniform_logits, ["cities", "visited"]), "sample", samples=11, augment=True)
+    assert drawn.method == "dan(s.11x8)"
+    views = {tuple(view.flatten().tolist()) for view in seen[0].round(decimals=5)}
+    assert len(seen[0]) == 11 and len(views) == 8
+
+
 def test_any_actor_can_plan():
     instance = uniform(np.random.default_rng(3), 20, 4)
     solution = solve(instance, make_actor(nearest))
@@ -280,9 +302,16 @@ def test_torchrls_collector_gathers_whole_episodes(network):
         assert batch["action_mask"].gather(2, batch["action"][..., None]).all()
 
 
-@pytest.mark.parametrize(("decode", "clip"), [("sample", 100.0), ("greedy", 10.0)])
-def test_large_instances_are_sampled_with_the_papers_sharper_clip(network, monkeypatch, decode, clip):
-    """Sec. 6.1: C = 100 from n = 500 on, for samples alone."""
+def test_samples_are_sharper_the_longer_the_game():
+    """Sec. 6.1: C = 10, and 100 from n = 500 on; between them, in proportion."""
+    assert [solution.sample_clip(10.0, n) for n in (2, 50, 100, 200, 500, 5000)] == [10, 10, 20, 40, 100, 100]
+    assert [solution.sample_clip(200.0, n) for n in (20, 1000)] == [200.0, 200.0]  # never flatter than it was trained
+    assert solution.sample_clip(5.0, 100) == 10.0
+    assert [solution.sample_clip(10.0, n, augment=True) for n in (10, 50, 100, 400)] == [10, 30, 60, 100]
+
+
+@pytest.mark.parametrize(("decode", "clip"), [("sample", 12.0), ("greedy", 10.0)])
+def test_a_sharper_clip_is_for_samples_alone(network, monkeypatch, decode, clip):
     clips = []
     forward = DAN.forward
 
@@ -291,12 +320,8 @@ def test_large_instances_are_sampled_with_the_papers_sharper_clip(network, monke
         return forward(self, *args)
 
     monkeypatch.setattr(DAN, "forward", watched)
-    monkeypatch.setattr(solution, "SHARP_FROM", 12)
-    solve(uniform(np.random.default_rng(0), 12, 3), network, decode, samples=2)
+    solve(uniform(np.random.default_rng(0), 60, 3), network, decode, samples=2)
     assert set(clips) == {clip}
-    clips.clear()
-    solve(uniform(np.random.default_rng(0), 11, 3), network, decode, samples=2)
-    assert set(clips) == {10.0}
     assert network.config.tanh_clip == 10.0  # the given network stays as it is
 
 

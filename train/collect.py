@@ -12,6 +12,7 @@ from torchrl.modules import ProbabilisticActor
 
 from dan_policy.actor import OBSERVATION, make_actor
 from dan_policy.episode import Decode, Episode, rollout
+from dan_policy.symmetry import views
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.instance import sample_nodes
 from train.config import RunConfig
@@ -52,15 +53,7 @@ def repeat(instances: Instances, samples: int) -> Instances:
     """Each instance ``samples`` times in a row, in another of the square's eight symmetries each time."""
     if samples == 1:
         return instances
-    nodes = torch.stack([symmetry(instances.nodes, k % 8) for k in range(samples)], dim=1)  # (B, samples, n, 2)
-    return Instances(nodes.flatten(0, 1), instances.n_agents)
-
-
-def symmetry(nodes: Tensor, k: int) -> Tensor:
-    """The ``k``-th of the eight rotations and reflections of the unit square, of nodes (..., 2); 0 changes nothing."""
-    x, y = nodes.unbind(-1)
-    x, y = (1 - x if k & 1 else x), (1 - y if k & 2 else y)
-    return torch.stack([y, x] if k & 4 else [x, y], dim=-1)
+    return Instances(views(instances.nodes, samples).flatten(0, 1), instances.n_agents)
 
 
 def draw_set(rng: np.random.Generator, config: RunConfig, count: int, sizes: int = 8) -> list[Instances]:

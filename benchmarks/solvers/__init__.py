@@ -124,7 +124,9 @@ SOLVERS: dict[str, Solver] = {
     "random": _policy("uniformly_random"),
     "nearest": _policy("nearest"),
     "dan-greedy": _policy("dan", weights="default"),
+    "dan-greedy-x8": _policy("dan", weights="default", augment=True),
     "dan-s64": _policy("dan", weights="default", samples=64),
+    "dan-s64-x8": _policy("dan", weights="default", samples=64, augment=True),
     "dan-s256": _policy("dan", weights="default", samples=256),
     "dan-improve": _policy("improved_dan", "numba", anytime=True, polishes=True, weights="default"),
     "reference": _ours("reference:solve", "numba"),
@@ -140,7 +142,7 @@ SOLVERS: dict[str, Solver] = {
 }
 
 GROUPS: dict[str, tuple[str, ...]] = {
-    "dan": ("dan-greedy", "dan-s64", "dan-s256", "dan-improve"),
+    "dan": ("dan-greedy", "dan-greedy-x8", "dan-s64", "dan-s64-x8", "dan-s256", "dan-improve"),
     "all": tuple(SOLVERS),
 }
 

@@ -11,11 +11,21 @@ from dan_policy import solve as play
 from mtsp_env.instance import Instance, Tours
 
 
-def dan(instance: Instance, seconds: float, seed: int, samples: int | None = None, policy: str = "default") -> Tours:
-    """The shipped DAN, greedy (``samples`` None) or the best of ``samples`` (paper, Sec. 6). Ignores ``seconds``."""
+def dan(
+    instance: Instance,
+    seconds: float,
+    seed: int,
+    samples: int | None = None,
+    augment: bool = False,
+    policy: str = "default",
+) -> Tours:
+    """The shipped DAN, greedy (``samples`` None) or the best of ``samples`` (paper, Sec. 6). Ignores ``seconds``.
+
+    ``augment``: in the square's symmetries.
+    """
     if samples is None:
-        return play(instance, policy, device="cpu").tours
-    return play(instance, policy, "sample", samples, seed, device="cpu").tours
+        return play(instance, policy, augment=augment, device="cpu").tours
+    return play(instance, policy, "sample", samples, seed, device="cpu", augment=augment).tours
 
 
 def improved_dan(instance: Instance, seconds: float, seed: int, policy: str = "default") -> Tours:
