@@ -19,7 +19,7 @@ from train.__main__ import main
 from train.baseline import RolloutBaseline, SharedBaseline, better
 from train.collect import Instances, costs, draw, draw_set, play, repeat
 from train.config import PAPER, QUICK, ReinforceConfig, check_same_run
-from train.loss import EpisodicReinforceLoss, backward, decisions_with_advantage, log_probs
+from train.loss import EpisodicReinforceLoss, backward, decisions_with_advantage, log_probs, subsample
 from train.reinforce import Trainer, reinforce
 
 TINY = replace(
@@ -120,6 +120,34 @@ def test_chunks_add_up_to_the_whole(trainer, decisions, chunk):
     assert chunked_loss == pytest.approx(loss, abs=1e-5)
     for a, b in zip(whole, chunked, strict=True):
         assert torch.allclose(a, b, atol=1e-5)
+
+
+def test_a_share_of_the_decisions_estimates_the_gradient_of_all(trainer, decisions, monkeypatch):
+    """Unbiased: averaged over every way to leave one of N out, the estimate is the whole; each is as likely."""
+    assert subsample(decisions, 1.0) is decisions
+    few = decisions[:12]
+    _, whole = gradients(trainer.network, few, 16, 12)
+    without = []
+    for left_out in range(12):
+        order = torch.arange(12).roll(11 - left_out)  # it comes last
+        with monkeypatch.context() as patch:
+            patch.setattr(torch, "randperm", lambda n, device, order=order: order)
+            part = subsample(few, 11 / 12)
+        assert len(part) == 11
+        without.append(gradients(trainer.network, part, 16, 12)[1])
+    for each, exact in zip(zip(*without, strict=True), whole, strict=True):
+        assert torch.allclose(sum(each) / 12, exact, atol=1e-5)
+
+    torch.manual_seed(3)
+    numbered = decisions.clone().set("number", torch.arange(len(decisions)))
+    drawn = [subsample(numbered, 0.25) for _ in range(400)]
+    count = round(0.25 * len(decisions))
+    assert all(len(part) == count and (part["number"].diff() > 0).all() for part in drawn)
+    for part in drawn[:5]:
+        assert torch.allclose(part["advantage"], decisions["advantage"][part["number"]] * len(decisions) / count)
+    often = torch.bincount(torch.cat([part["number"] for part in drawn]), minlength=len(decisions)) / 400
+    assert (often - count / len(decisions)).abs().max() < 0.1  # 4.6 standard deviations
+    assert len(subsample(decisions, 1e-9)) == 1
 
 
 def test_the_loss_is_torchrls_reinforce_loss_with_another_average(trainer, decisions):
@@ -318,6 +346,7 @@ def test_training_lowers_the_greedy_cost_on_held_out_instances(tmp_path):
         ({"n_agents": (3, 2)}, r"n_agents\[1\] must be a whole number of at least 3, got 2"),
         ({"batch_size": 0}, "batch_size must be a whole number of at least 1, got 0"),
         ({"learning_rate": 0.0}, "learning_rate must be above 0"),
+        ({"decisions": 0.0}, "decisions must be above 0 and at most 1, got 0.0"),
         ({"challenge_p": 1.0}, "challenge_p must lie between 0 and 1"),
         ({"distribution": "normal"}, "unknown distribution 'normal'"),
         ({"baseline": "shared"}, "samples must be a whole number of at least 2, got 1"),

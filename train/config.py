@@ -148,6 +148,8 @@ class ReinforceConfig(RunConfig):
     challenge_p: float = 0.05
     """One-sided paired t-test: the policy replaces the baseline below this p."""
 
+    decisions: float = 1.0
+    """Share of a batch's decisions that its gradient is estimated from, drawn at random."""
     chunk: int = 512
     """Decisions whose log-probabilities are recomputed at once: the bound on memory."""
 
@@ -162,6 +164,8 @@ class ReinforceConfig(RunConfig):
         for first, *ranges in self.curriculum:
             check_count("curriculum: from step", first, 0)
             replace(self, curriculum=(), n_nodes=tuple(ranges[:2]), n_agents=tuple(ranges[2:]))
+        if not 0 < self.decisions <= 1:
+            raise ValueError(f"decisions must be above 0 and at most 1, got {self.decisions!r}")
         if not 0 < self.challenge_p < 1:
             raise ValueError(f"challenge_p must lie between 0 and 1, got {self.challenge_p!r}")
 

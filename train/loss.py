@@ -70,6 +70,20 @@ def decisions_with_advantage(episode: Episode, advantage: Tensor) -> TensorDictB
     return decisions[episode.valid]
 
 
+def subsample(decisions: TensorDictBase, share: float) -> TensorDictBase:
+    """A random ``share`` of the decisions, at least one, in their order; advantages grow so that sums keep their mean.
+
+    An unbiased estimate of the whole batch's gradient for a share of the backward pass, most of a step's time: the
+    decisions of an episode have one advantage, whose noise they share.
+    """
+    if share >= 1:
+        return decisions
+    count = max(1, round(share * len(decisions)))
+    drawn = torch.randperm(len(decisions), device=decisions.device)[:count].sort().values
+    part = decisions[drawn]
+    return part.set("advantage", part["advantage"] * (len(decisions) / count))
+
+
 def chunks(decisions: TensorDictBase, size: int) -> Iterator[TensorDictBase]:
     """Consecutive parts of at most ``size`` decisions."""
     yield from decisions.split(size, dim=0)

@@ -14,7 +14,7 @@ from train.collect import Instances, autocast, draw, play, repeat
 from train.config import ReinforceConfig
 from train.distributed import average_gradients, processes, world_size
 from train.learner import Learner, check_folder, run
-from train.loss import EpisodicReinforceLoss, backward, decisions_with_advantage
+from train.loss import EpisodicReinforceLoss, backward, decisions_with_advantage, subsample
 from train.remote import RayWorkers
 
 
@@ -42,7 +42,7 @@ class Trainer(Learner):
         advantage = episode.reward - value
         if config.normalise:
             advantage = advantage / (advantage.std() + 1e-8)
-        decisions = decisions_with_advantage(episode, advantage)
+        decisions = subsample(decisions_with_advantage(episode, advantage), config.decisions)
         self.optimiser.zero_grad()
         with autocast(config):
             loss = EpisodicReinforceLoss(make_actor(self.network), n_episodes=len(advantage))
