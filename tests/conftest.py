@@ -1,12 +1,13 @@
-"""What every test may ask for: a square solved by hand. Pictures never open a window."""
+"""What every test may ask for: a square solved by hand, and a folder with it. Pictures never open a window."""
 
 import os
+from pathlib import Path
 
 os.environ["MPLBACKEND"] = "Agg"  # before anything imports matplotlib
 
 import pytest
 
-from mtsp_env import Instance
+from mtsp_env import Instance, write_instance
 
 
 @pytest.fixture
@@ -30,3 +31,14 @@ def square() -> Instance:
 def square_tours() -> list[list[int]]:
     """Tours that solve ``square``: both of length 2."""
     return [[0, 2, 1, 3, 0], [0, 4, 5, 6, 0]]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch, square: Instance) -> Path:
+    """The working directory, with the square in it in two formats."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
+    write_instance("square.json", square)
+    rows = "".join(f"{k} {10 * x} {10 * y}\n" for k, (x, y) in enumerate(square.nodes, 1))
+    Path("ten.tsp").write_text(f"NAME: ten\nDIMENSION: 7\nEDGE_WEIGHT_TYPE: EUC_2D\nNODE_COORD_SECTION\n{rows}EOF\n")
+    return tmp_path

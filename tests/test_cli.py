@@ -1,27 +1,21 @@
 """The command ``mtsp``: what it prints and writes, every bad input one line and exit code 2, quick to start."""
 
 import json
-import os
-import subprocess
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from command import refused
 
 import dan_policy
 from dan_policy.cli import main
 from mtsp_env import (
     Instance,
     __version__,
-    check_tours,
-    lower_bound,
     makespan,
     read_instance,
     read_tours,
-    read_tsplib,
     uniform,
     write_instance,
 )
@@ -51,30 +45,6 @@ def solver(monkeypatch) -> FakeSolve:
     fake = FakeSolve()
     monkeypatch.setitem(vars(dan_policy), "solve", fake)
     return fake
-
-
-@pytest.fixture
-def folder(tmp_path, monkeypatch, square: Instance) -> Path:
-    """The working directory, with the square in it in two formats."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "80")
-    write_instance("square.json", square)
-    rows = "".join(f"{k} {10 * x} {10 * y}\n" for k, (x, y) in enumerate(square.nodes, 1))
-    Path("ten.tsp").write_text(f"NAME: ten\nDIMENSION: 7\nEDGE_WEIGHT_TYPE: EUC_2D\nNODE_COORD_SECTION\n{rows}EOF\n")
-    return tmp_path
-
-
-def refused(capsys, *argv: str) -> str:
-    """The one line on stderr of a command that is refused."""
-    with pytest.raises(SystemExit) as caught:
-        main(argv)
-    printed = capsys.readouterr()
-    assert caught.value.code == 2
-    assert printed.out == ""
-    assert printed.err.startswith("mtsp: error: ")
-    assert printed.err.count("\n") == 1
-    assert printed.err.endswith("\n")
-    return printed.err
 
 
 # mtsp solve
@@ -361,87 +331,3 @@ def test_version_and_help(capsys) -> None:
 def test_no_command_or_an_unknown_one(capsys) -> None:
     assert "required: COMMAND" in refused(capsys)
     assert "invalid choice: 'sovle'" in refused(capsys, "sovle")
-
-
-def run(*argv: str, missing: Sequence[str] = (), **options) -> subprocess.CompletedProcess:
-    """The command as a process of its own, in which importing the ``missing`` modules fails."""
-    code = (
-        "import sys\n"
-        f"sys.modules.update(dict.fromkeys({tuple(missing)}))\n"
-        "from dan_policy.cli import main\n"
-        "sys.exit(main(sys.argv[1:]))\n"
-    )
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent)}
-    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
-    return subprocess.run([sys.executable, "-c", code, *argv], env=environment, text=True, check=False, **options)
-
-
-TORCH = ("torch", "tensordict", "torchrl")
-
-
-def test_only_solving_imports_what_is_heavy(tmp_path) -> None:
-    missing, file = (*TORCH, "matplotlib", "numba", "rich", "vrplib"), str(tmp_path / "a.json")
-    made = run("generate", "--nodes", "5", "--agents", "2", file, missing=missing)
-    assert (made.returncode, made.stderr) == (0, "")
-    solved = run("solve", file, missing=missing)
-    assert solved.returncode == 2
-    assert solved.stderr.startswith("mtsp: error: ")
-    assert solved.stderr.count("\n") == 1
-    assert 'pip install "mtsp-env[dan]"' in solved.stderr
-
-
-def test_the_reference_alone_needs_no_torch(folder, square: Instance) -> None:
-    pytest.importorskip("numba", reason="needs the extra reference")
-    argv = ("solve", "square.json", "--method", "reference", "--seed", "3")
-    done = run(*argv, "--json", missing=(*TORCH, "rich"))
-    assert (done.returncode, done.stderr) == (0, "")
-    found = json.loads(done.stdout)
-    check_tours(square, found["tours"])
-    assert (found["makespan"], found["method"]) == (2.0, "reference")
-    without_rich, without_numba = (run(*argv, missing=(*TORCH, name)) for name in ("rich", "numba"))
-    assert (without_rich.returncode, without_numba.returncode) == (2, 2)
-    assert without_rich.stderr.startswith("mtsp: error: the table needs rich")
-    assert "pip install 'mtsp-env[reference]'" in without_numba.stderr
-    assert without_rich.stderr.count("\n") == without_numba.stderr.count("\n") == 1
-    assert without_rich.stdout == without_numba.stdout == ""
-
-
-@pytest.mark.skipif(os.name == "nt", reason="pipes break differently there")
-def test_a_reader_that_has_seen_enough_is_no_error(tmp_path) -> None:
-    reader, writer = os.pipe()
-    os.close(reader)
-    argv = ("generate", "--nodes", "5", "--agents", "2", str(tmp_path / "a.json"))
-    done = run(*argv, stdout=writer)
-    os.close(writer)
-    assert (done.returncode, done.stderr) == (1, "")
-
-
-def test_solves_with_a_policy_from_a_file(folder, capsys) -> None:
-    """No fake here: an untrained network plans tours that the judge accepts."""
-    pytest.importorskip("torchrl", reason="needs the extra dan")
-    network = dan_policy.DAN(dan_policy.DANConfig(embed_dim=16, feedforward_dim=16, n_heads=2, city_layers=1))
-    dan_policy.save("mine.safetensors", network)
-    instance = read_tsplib(EUROPE, 3)
-    for options in ("", "--decode sample --samples 4 --seed 1"):
-        argv = ["solve", str(EUROPE), "--agents", "3", "--policy", "mine.safetensors", "--json", *options.split()]
-        assert main(argv) == 0
-        found = json.loads(capsys.readouterr().out)
-        check_tours(instance, found["tours"])
-        assert found["makespan"] == pytest.approx(makespan(instance.nodes, found["tours"]) * instance.scale)
-        assert found["lower_bound"] == lower_bound(instance) * instance.scale <= found["makespan"]
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ("--policy nowhere.safetensors", "nowhere.safetensors"),
-        ("--policy square.json", "square.json"),
-        ("--policy mine.safetensors --device nonsense", "nonsense"),
-        ("--policy mine.safetensors --device cuda:99", "cuda:99"),
-    ],
-)
-def test_the_real_solver_refuses_in_one_line(folder, capsys, options: str, message: str) -> None:
-    pytest.importorskip("torchrl", reason="needs the extra dan")
-    network = dan_policy.DAN(dan_policy.DANConfig(embed_dim=16, feedforward_dim=16, n_heads=2, city_layers=1))
-    dan_policy.save("mine.safetensors", network)
-    assert message in refused(capsys, "solve", "square.json", *options.split())

@@ -1,0 +1,86 @@
+"""The command ``mtsp`` with nothing faked: processes that lack packages, broken pipes, the real solver."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+from command import refused, run
+
+import dan_policy
+from dan_policy.cli import main
+from mtsp_env import Instance, check_tours, lower_bound, makespan, read_tsplib
+
+pytest.importorskip("rich", reason="needs the extra dan")
+pytest.importorskip("vrplib", reason="needs the extra tsplib")
+
+EUROPE = Path(__file__).parent.parent / "examples" / "europe.tsp"
+TORCH = ("torch", "tensordict", "torchrl")
+
+
+def test_only_solving_imports_what_is_heavy(tmp_path) -> None:
+    missing, file = (*TORCH, "matplotlib", "numba", "rich", "vrplib"), str(tmp_path / "a.json")
+    made = run("generate", "--nodes", "5", "--agents", "2", file, missing=missing)
+    assert (made.returncode, made.stderr) == (0, "")
+    solved = run("solve", file, missing=missing)
+    assert solved.returncode == 2
+    assert solved.stderr.startswith("mtsp: error: ")
+    assert solved.stderr.count("\n") == 1
+    assert 'pip install "mtsp-env[dan]"' in solved.stderr
+
+
+def test_the_reference_alone_needs_no_torch(folder, square: Instance) -> None:
+    pytest.importorskip("numba", reason="needs the extra reference")
+    argv = ("solve", "square.json", "--method", "reference", "--seed", "3")
+    done = run(*argv, "--json", missing=(*TORCH, "rich"))
+    assert (done.returncode, done.stderr) == (0, "")
+    found = json.loads(done.stdout)
+    check_tours(square, found["tours"])
+    assert (found["makespan"], found["method"]) == (2.0, "reference")
+    without_rich, without_numba = (run(*argv, missing=(*TORCH, name)) for name in ("rich", "numba"))
+    assert (without_rich.returncode, without_numba.returncode) == (2, 2)
+    assert without_rich.stderr.startswith("mtsp: error: the table needs rich")
+    assert "pip install 'mtsp-env[reference]'" in without_numba.stderr
+    assert without_rich.stderr.count("\n") == without_numba.stderr.count("\n") == 1
+    assert without_rich.stdout == without_numba.stdout == ""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="pipes break differently there")
+def test_a_reader_that_has_seen_enough_is_no_error(tmp_path) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    argv = ("generate", "--nodes", "5", "--agents", "2", str(tmp_path / "a.json"))
+    done = run(*argv, stdout=writer)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (1, "")
+
+
+def test_solves_with_a_policy_from_a_file(folder, capsys) -> None:
+    """No fake here: an untrained network plans tours that the judge accepts."""
+    pytest.importorskip("torchrl", reason="needs the extra dan")
+    network = dan_policy.DAN(dan_policy.DANConfig(embed_dim=16, feedforward_dim=16, n_heads=2, city_layers=1))
+    dan_policy.save("mine.safetensors", network)
+    instance = read_tsplib(EUROPE, 3)
+    for options in ("", "--decode sample --samples 4 --seed 1"):
+        argv = ["solve", str(EUROPE), "--agents", "3", "--policy", "mine.safetensors", "--json", *options.split()]
+        assert main(argv) == 0
+        found = json.loads(capsys.readouterr().out)
+        check_tours(instance, found["tours"])
+        assert found["makespan"] == pytest.approx(makespan(instance.nodes, found["tours"]) * instance.scale)
+        assert found["lower_bound"] == lower_bound(instance) * instance.scale <= found["makespan"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--policy nowhere.safetensors", "nowhere.safetensors"),
+        ("--policy square.json", "square.json"),
+        ("--policy mine.safetensors --device nonsense", "nonsense"),
+        ("--policy mine.safetensors --device cuda:99", "cuda:99"),
+    ],
+)
+def test_the_real_solver_refuses_in_one_line(folder, capsys, options: str, message: str) -> None:
+    pytest.importorskip("torchrl", reason="needs the extra dan")
+    network = dan_policy.DAN(dan_policy.DANConfig(embed_dim=16, feedforward_dim=16, n_heads=2, city_layers=1))
+    dan_policy.save("mine.safetensors", network)
+    assert message in refused(capsys, "solve", "square.json", *options.split())
