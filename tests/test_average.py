@@ -1,0 +1,55 @@
+"""Averaged weights are the mean, of networks that can be averaged, and say where they come from."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from dan_policy import DAN, DANConfig, load, save
+from dan_policy.weights import load_extra
+from train.__main__ import main
+from train.config import REFINE
+from train.reinforce import reinforce
+
+SMALL = DANConfig(embed_dim=16, feedforward_dim=32, n_heads=2, city_layers=1)
+
+
+@pytest.fixture
+def files(tmp_path) -> list[str]:
+    torch.manual_seed(0)
+    for name in ("a", "b"):
+        save(tmp_path / f"{name}.safetensors", DAN(SMALL), step=name)
+    return [str(tmp_path / f"{name}.safetensors") for name in ("a", "b")]
+
+
+def test_the_average_is_the_mean_of_every_weight(files, tmp_path):
+    out = tmp_path / "new" / "mean.safetensors"
+    assert main(["average", *files, files[0], "--out", str(out)]) == 0
+    a, b, mean = (load(file).state_dict() for file in (*files, out))
+    for name, weight in mean.items():
+        assert torch.allclose(weight, (2 * a[name] + b[name]) / 3, atol=1e-6), name
+    assert load(out).config == SMALL
+    assert load_extra(out) == {"averaged": [{"step": "a"}, {"step": "b"}, {"step": "a"}]}
+
+
+def test_validation_is_that_of_the_runs(files, tmp_path, capsys):
+    small = {"n_nodes": (10, 12), "n_agents": (2, 2), "validation_instances": 6, "tensorboard": False}
+    run = reinforce(replace(REFINE, out=tmp_path / "run", init=files[0], steps=1, validate_every=1, **small))
+    assert main(f"validate {tmp_path}/run/best.safetensors --n-nodes 10 12 --n-agents 2 2 --instances 6".split()) == 0
+    cost, file = capsys.readouterr().out.split()
+    assert float(cost) == pytest.approx(run.best, abs=1e-4) and file.endswith("best.safetensors")
+    assert main(["validate", str(tmp_path / "none.safetensors")]) == 2
+
+
+def test_what_cannot_be_averaged_is_refused(files, tmp_path, capsys):
+    out, other = tmp_path / "mean.safetensors", tmp_path / "other.safetensors"
+    save(other, DAN(DANConfig(embed_dim=16, feedforward_dim=16, n_heads=2, city_layers=1)))
+    for named, message in (
+        (files[:1], "name at least 2 files to average, got 1"),
+        ([files[0], str(other)], "other.safetensors: another configuration than"),
+        ([files[0], str(tmp_path / "none.safetensors")], "none.safetensors"),
+    ):
+        assert main(["average", *named, "--out", str(out)]) == 2
+        printed = capsys.readouterr().err
+        assert message in printed and printed.count("\n") == 1
+    assert not out.exists()
