@@ -38,7 +38,8 @@ def test_validation_is_that_of_the_runs(files, tmp_path, capsys):
     assert main(f"validate {tmp_path}/run/best.safetensors --n-nodes 10 12 --n-agents 2 2 --instances 6".split()) == 0
     cost, file = capsys.readouterr().out.split()
     assert float(cost) == pytest.approx(run.best, abs=1e-4) and file.endswith("best.safetensors")
-    assert main(["validate", str(tmp_path / "none.safetensors")]) == 2
+    assert main(["validate", str(tmp_path / "none.safetensors")]) == main(["validate"]) == 2
+    assert "name at least 1 file to validate" in capsys.readouterr().err
 
 
 def test_what_cannot_be_averaged_is_refused(files, tmp_path, capsys):

@@ -64,6 +64,8 @@ def validate_command(
         instances: how many.
         device: cpu, cuda, ...
     """
+    if not files:
+        raise ValueError("name at least 1 file to validate")
     same = {"nodes_per_agent": REFINE.nodes_per_agent, "speed": REFINE.speed, "depot": REFINE.depot, "device": device}
     config = RunConfig(n_nodes=n_nodes, n_agents=n_agents, validation_instances=instances, **same)
     for file in files:
