@@ -71,7 +71,7 @@ class AttentionLayer(nn.Module):
         self.key_value = nn.Linear(embed_dim, 2 * embed_dim, bias=False)
         self.out = nn.Linear(embed_dim, embed_dim, bias=False)
         self.feedforward = nn.Sequential(
-            nn.Linear(embed_dim, feedforward_dim), nn.ReLU(), nn.Linear(feedforward_dim, embed_dim)
+            nn.Linear(embed_dim, feedforward_dim), nn.ReLU(inplace=True), nn.Linear(feedforward_dim, embed_dim)
         )
         self.norm_attention = nn.LayerNorm(embed_dim)
         self.norm_feedforward = nn.LayerNorm(embed_dim)
