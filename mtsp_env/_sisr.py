@@ -9,6 +9,9 @@ to the depot, lengths are kept up to date, a rejected change is undone from a lo
 nodes 1..n-1 are the cities, and node n + a is agent a's own copy of the depot, both the start and the end of its tour;
 node 0 is unused.
 
+An agent that is under way has a head: the city that it is going to, behind all that it has driven. The leg to it has
+the length -inf, so that no detour before it is ever the cheapest place, without a question in the inner loop.
+
 The kernels share one file because Numba's cache on disk sees no change in other files than a compiled function's own.
 """
 
@@ -46,7 +49,9 @@ class Search(NamedTuple):
     leg: np.ndarray  # (N,) float64, distance from the previous node
     tour: np.ndarray  # (N,) int32, the agent; -1: on no tour
     length: np.ndarray  # (m,) float64, of each tour
-    count: np.ndarray  # (m,) int32, cities on each tour
+    count: np.ndarray  # (m,) int32, cities on each tour that may be moved: all but the head
+    head: np.ndarray  # (m,) int32, the tour's first city where it must stay so; the agent's depot: closed; 0: free
+    driven: np.ndarray  # (m,) float64, length of the tour as far as the head
     ruined: np.ndarray  # (m,) int64, the iteration that last took a string from the tour
     best: np.ndarray  # (N,) int32, ``next`` of the best tours so far
     random: np.ndarray  # (1,) uint64, state of the random numbers, not 0
@@ -78,7 +83,10 @@ def nearest_cities(x: np.ndarray, y: np.ndarray, n: int, n_near: int) -> tuple[n
 
 @njit(cache=True, nogil=True)
 def insert_greedily(search: Search, order: np.ndarray) -> None:
-    """Put the cities, in this ``order`` (n - 1,), on the empty tours, each where its tour stays shortest. O(n^2)."""
+    """Put the cities of ``order`` on the tours in this order, each where its tour stays shortest. O(n^2).
+
+    Without heads the tours begin empty; with any, ``load_tours`` and ``sum_lengths`` have put these on theirs.
+    """
     depot = search.tour.shape[0] - search.length.shape[0]
     for city in order:
         least, place = inf, depot
@@ -96,7 +104,7 @@ def insert_greedily(search: Search, order: np.ndarray) -> None:
 
 @njit(cache=True, nogil=True)
 def load_tours(search: Search, order: np.ndarray) -> None:
-    """Make the tours anew from ``order`` (n - 1 + m,): the cities of each tour and then a 0."""
+    """Make the tours anew from ``order`` (n - 1 + m,): the cities of each tour, its head first, and then a 0."""
     depot = search.tour.shape[0] - search.length.shape[0]
     search.count[:] = 0
     for node in range(depot, search.tour.shape[0]):
@@ -107,6 +115,9 @@ def load_tours(search: Search, order: np.ndarray) -> None:
             home += 1
         else:
             _link(search, node, search.previous[home])
+    for agent in range(search.head.shape[0]):
+        if 0 < search.head[agent] < depot:
+            search.count[agent] -= 1
     search.best[:] = search.next
 
 
@@ -133,8 +144,11 @@ def sum_lengths(search: Search) -> float:
     n_agents = search.length.shape[0]
     depot = search.tour.shape[0] - n_agents
     for agent in range(n_agents):
-        length, node = 0.0, depot + agent
-        while True:
+        length, node = search.driven[agent], depot + agent
+        if search.head[agent] > 0:
+            node = search.head[agent]
+            search.leg[node] = -inf
+        while search.head[agent] != depot + agent:
             before, node = node, search.next[node]
             search.leg[node] = _distance(search, before, node)
             length += search.leg[node]
@@ -201,7 +215,7 @@ def _ruin(search, iteration, makespan):
     for k in range(-1, search.near.shape[1]):
         city = centre if k < 0 else search.near[centre, k]
         agent = search.tour[city]
-        if agent < 0 or search.ruined[agent] == iteration:
+        if agent < 0 or search.ruined[agent] == iteration or search.leg[city] == -inf:
             continue
         search.ruined[agent] = iteration
         before = search.length[agent]
@@ -227,7 +241,7 @@ def _remove_string(search, n_removed, city, agent, max_string):
     span = n_remove + n_leave
     # The string begins up to span - 1 cities before this one, as far as the ends of the tour allow
     node, behind, most_behind = city, 0, int(_random(search) * span)
-    while behind < most_behind and search.previous[node] < depot:
+    while behind < most_behind and search.previous[node] < depot and search.leg[search.previous[node]] > -inf:
         node = search.previous[node]
         behind += 1
     last, ahead = city, 0

@@ -33,7 +33,7 @@ except ModuleNotFoundError as error:
     ) from error
 
 from mtsp_env.instance import Instance, Tours, check_count, check_nodes
-from mtsp_env.tours import check_tours, farthest_trip, makespan
+from mtsp_env.tours import check_tours, farthest_trip, makespan, tour_lengths
 
 ITERATIONS_PER_NODE = 500  # where neither seconds nor iterations are given
 HOT, COLD = 0.1, 0.0025  # first and last temperature, in units of makespan * sqrt(m / n), a few mean legs
@@ -50,8 +50,11 @@ def improve(
     seconds: float | None = None,
     iterations: int | None = None,
     seed: int = 0,
+    prefixes: Sequence[Sequence[int]] | None = None,
 ) -> Tours:
     """Near-optimal tours for ``instance``, never worse than the given ``tours``.
+
+    With ``prefixes`` the agents are under way, and the rest of their tours is planned: for who has to replan a team.
 
     The search takes ``seconds`` or ``iterations``, whichever is over first (neither: 500 iterations for each node), and
     ends early where the makespan is the farthest out-and-back trip, which none can beat.
@@ -64,21 +67,30 @@ def improve(
         iterations: at least 0; 2 to 4 microseconds each, longer with hundreds of agents. Without ``seconds`` the result
             depends on nothing but the arguments.
         seed: a whole number of at least 0.
+        prefixes: how each agent's tour begins, as ``rules.tours(..., close=False)`` tells it of a game: [0, 3, 5] went
+            to city 3 and is at or on the way to city 5, [0] has not left yet, [0, 3, 0] is home for good. The cost
+            stays the length of the whole tours.
 
     Returns:
         One tour per agent, [0, ..., 0]; ``tours`` themselves, copied, where nothing better was found.
 
     Raises:
-        ValueError: tours that do not solve the instance, or a number outside its range.
+        ValueError: tours that do not solve the instance or do not begin with the prefixes, prefixes that no tours begin
+            with, or a number outside its range.
     """
     if seconds is not None:
         check_seconds("seconds", seconds)
     _check_search(iterations, seed)
+    if prefixes is not None:
+        prefixes = _check_prefixes(instance.n_nodes, instance.n_agents, prefixes)
     if tours is not None:
         check_tours(instance, tours)
         tours = [[int(node) for node in tour] for tour in tours]
+        for agent, (tour, prefix) in enumerate(zip(tours, prefixes or [], strict=False)):
+            if tour[: len(prefix)] != prefix or (_closed(prefix) and tour != prefix):
+                raise ValueError(f"tour {agent} must begin with its prefix {prefix}, got {tour}")
     compile_kernels()
-    found = _solve(instance.nodes, instance.n_agents, tours, seconds, iterations, seed)
+    found = _solve(instance.nodes, instance.n_agents, tours, seconds, iterations, seed, prefixes=prefixes)
     if tours is not None and makespan(instance.nodes, tours) <= makespan(instance.nodes, found):
         return tours
     return found
@@ -91,16 +103,17 @@ def improve_batch(
     seed: int = 0,
     threads: int | None = None,
     tidy: bool = False,
+    prefixes: Sequence[Sequence[Sequence[int]]] | None = None,
 ) -> list[Tours]:
     """Near-optimal tours for each row of ``nodes`` (B, n, 2), the rows spread over ``threads``.
 
-    Row b is ``improve(Instance(nodes[b], n_agents), iterations=iterations, seed=seed)``, whatever the other rows and
-    the number of threads (None: one for each core that this process may use). ``tidy`` also keeps the tours short that
-    do not set the makespan, for which a search otherwise does no more than it must: the makespan plus 1 % of the total
-    length counts, and no search ends early. Tours to learn from should be tidy.
+    Row b is ``improve(Instance(nodes[b], n_agents), iterations=iterations, seed=seed, prefixes=prefixes[b])``, whatever
+    the other rows and the number of threads (None: one for each core that this process may use). ``tidy`` also keeps
+    the tours short that do not set the makespan, for which a search otherwise does no more than it must: the makespan
+    plus 1 % of the total length counts, and no search ends early. Tours to learn from should be tidy.
 
     Raises:
-        ValueError: nodes that are not B instances, or a number outside its range.
+        ValueError: nodes that are not B instances, prefixes that no tours begin with, or a number outside its range.
     """
     nodes = np.asarray(nodes, dtype=np.float64)
     if nodes.ndim != 3:
@@ -111,9 +124,15 @@ def improve_batch(
     _check_search(iterations, seed)
     threads = _usable_cores() if threads is None else threads
     check_count("threads", threads, minimum=1)
+    begun: list[Tours | None] = [None] * len(nodes)
+    if prefixes is not None:
+        if len(prefixes) != len(nodes):
+            raise ValueError(f"expected prefixes for {len(nodes)} instances, got {len(prefixes)}")
+        begun = [_check_prefixes(nodes.shape[1], n_agents, one) for one in prefixes]
     compile_kernels()
     with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(lambda row: _solve(row, n_agents, None, None, iterations, seed, tidy), nodes))
+        solve = functools.partial(_solve, n_agents=n_agents, iterations=iterations, seed=seed, tidy=tidy)
+        return list(pool.map(lambda row, prefixes: solve(row, prefixes=prefixes), nodes, begun))
 
 
 def check_seconds(name: str, value: float) -> None:
@@ -127,6 +146,31 @@ def _check_search(iterations: int | None, seed: int) -> None:
     if iterations is not None:
         check_count("iterations", iterations, minimum=0)
     check_count("seed", seed, minimum=0)
+
+
+def _check_prefixes(n_nodes: int, n_agents: int, prefixes: Sequence[Sequence[int]]) -> Tours:
+    """The prefixes as lists. Raises ValueError where no tours begin with them."""
+    prefixes = [[int(node) for node in prefix] for prefix in prefixes]
+    if len(prefixes) != n_agents:
+        raise ValueError(f"expected {n_agents} prefixes, one per agent, got {len(prefixes)}")
+    seen: set[int] = set()
+    for agent, prefix in enumerate(prefixes):
+        if not prefix or prefix[0] != 0:
+            raise ValueError(f"prefix {agent} must begin at the depot 0, got {prefix}")
+        for node in prefix:
+            if not 0 <= node < n_nodes:
+                raise ValueError(f"prefix {agent} visits node {node}, outside 0..{n_nodes - 1}")
+            if node and node in seen:
+                raise ValueError(f"city {node} is in the prefixes more than once")
+            seen.add(node)
+    if len(seen) < n_nodes and all(map(_closed, prefixes)):
+        raise ValueError(f"all agents are home for good, and {n_nodes - len(seen)} cities are left")
+    return prefixes
+
+
+def _closed(prefix: Sequence[int]) -> bool:
+    """Whether an agent whose tour begins so is home for good."""
+    return len(prefix) > 1 and prefix[-1] == 0
 
 
 def _usable_cores() -> int:
@@ -145,34 +189,70 @@ def compile_kernels() -> None:
 def _solve(
     nodes: np.ndarray,
     n_agents: int,
-    tours: Tours | None,
-    seconds: float | None,
-    iterations: int | None,
-    seed: int,
+    tours: Tours | None = None,
+    seconds: float | None = None,
+    iterations: int | None = None,
+    seed: int = 0,
     tidy: bool = False,
+    prefixes: Tours | None = None,
 ) -> Tours:
     """``improve`` without its checks."""
     started = time.perf_counter()
-    n = len(nodes)
-    if seconds is None and iterations is None:
-        iterations = ITERATIONS_PER_NODE * n
-    home = np.hypot(*(nodes - nodes[0]).T)  # (n,)
-    enough = farthest_trip(nodes) + CLOSED  # lower_bound's other part, the spanning tree, is never attained
+    enough = farthest_trip(nodes)  # lower_bound's other part, the spanning tree, is never attained
+    if prefixes is None:
+        # More agents than cities are of no use
+        search = _new_search(nodes, min(n_agents, len(nodes) - 1), seed)
+        start = None if tours is None else _as_order(tours, len(search.best) - 1)
+        _optimise(search, 1, start, enough, tidy, seconds, iterations, started)
+        return _as_tours(_sisr.best_order(search), n_agents)
 
-    # More agents than cities are of no use
-    search = _new_search(nodes, min(n_agents, n - 1), seed)
-    _sisr.insert_greedily(search, 1 + np.argsort(-home[1:], kind="stable"))
+    heads = [prefix[-1] for prefix in prefixes if prefix[-1] != 0]
+    free = sorted(set(range(1, len(nodes))).difference(*prefixes))
+    if not free:
+        return [prefix if _closed(prefix) else [*prefix, 0] for prefix in prefixes]
+    kept = [0, *heads, *free]  # what is left of the instance; its nodes are numbered anew
+    search = _new_search(nodes[kept], n_agents, seed)
+    _set_off(search, prefixes, tour_lengths(nodes, prefixes))
+    enough = max(enough, _sisr.sum_lengths(search))  # of everybody going home at once
+    start = None if tours is None else _rest_as_order(tours, prefixes, kept)
+    _optimise(search, 1 + len(heads), start, enough, tidy, seconds, iterations, started)
+    rest = _as_tours(_sisr.best_order(search), n_agents)
+    return [
+        prefix if _closed(prefix) else [*prefix, *(kept[node] for node in tour[1 if prefix == [0] else 2 :])]
+        for prefix, tour in zip(prefixes, rest, strict=True)
+    ]
+
+
+def _optimise(
+    search: _sisr.Search,
+    first_free: int,
+    start: np.ndarray | None,
+    enough: float,
+    tidy: bool,
+    seconds: float | None,
+    iterations: int | None,
+    started: float,
+) -> None:
+    """Put the cities from ``first_free`` on onto the tours, or start from better ones (``start``), and improve them."""
+    n = len(search.near)
+    home = np.hypot(search.x[:n] - search.x[0], search.y[:n] - search.y[0])
+    _sisr.insert_greedily(search, first_free + np.argsort(-home[first_free:], kind="stable"))
     greedy = best = _sisr.sum_lengths(search)
-    if tours is not None and makespan(nodes, tours) < greedy:
-        _sisr.load_tours(search, _as_order(tours, len(search.best) - 1))
+    if start is not None:
+        inserted = _sisr.best_order(search)
+        _sisr.load_tours(search, start)
         best = _sisr.sum_lengths(search)
+        if best >= greedy:
+            _sisr.load_tours(search, inserted)
+            best = _sisr.sum_lengths(search)
 
-    unit, weight = greedy * math.sqrt(len(search.length) / n), 0.0
+    unit, weight, enough = greedy * math.sqrt(len(search.length) / n), 0.0, enough + CLOSED
     if tidy:
         weight, enough = _sisr.TOTAL_WEIGHT, -math.inf
         best += weight * float(search.length.sum())
+    if seconds is None and iterations is None:
+        iterations = ITERATIONS_PER_NODE * n
     _anneal(search, best, enough, weight, unit, seconds, iterations, started)
-    return _as_tours(_sisr.best_order(search), n_agents)
 
 
 def _anneal(
@@ -230,6 +310,8 @@ def _new_search(nodes: np.ndarray, n_agents: int, seed: int) -> _sisr.Search:
         tour=np.maximum(itself - n, -1),
         length=np.zeros(n_agents),
         count=np.zeros(n_agents, np.int32),
+        head=np.zeros(n_agents, np.int32),
+        driven=np.zeros(n_agents),
         ruined=np.zeros(n_agents, np.int64),
         best=itself.copy(),
         random=np.array([_spread(seed)], np.uint64),
@@ -239,6 +321,28 @@ def _new_search(nodes: np.ndarray, n_agents: int, seed: int) -> _sisr.Search:
         length_log=np.zeros((2, n)),
         key=np.zeros(n),
     )
+
+
+def _set_off(search: _sisr.Search, prefixes: Tours, driven: np.ndarray) -> None:
+    """Put the agents where their ``prefixes`` end: nodes 1, 2, ... of ``search`` are the last ones that are cities."""
+    depot, head, order = len(search.near), 1, []
+    for agent, prefix in enumerate(prefixes):
+        if prefix[-1] != 0:
+            search.head[agent] = head
+            order.append(head)
+            head += 1
+        elif _closed(prefix):
+            search.head[agent] = depot + agent
+        order.append(0)
+    search.driven[:] = driven
+    _sisr.load_tours(search, np.array(order, dtype=np.int64))
+
+
+def _rest_as_order(tours: Tours, prefixes: Tours, kept: list[int]) -> np.ndarray:
+    """What is left of ``tours``, which begin with ``prefixes``, as ``_sisr.load_tours`` takes it."""
+    number = {node: i for i, node in enumerate(kept)}
+    rests = [tour[max(0, len(prefix) - 1) :] for tour, prefix in zip(tours, prefixes, strict=True)]
+    return np.array([i for rest in rests for i in [*(number[node] for node in rest if node != 0), 0]], dtype=np.int64)
 
 
 def _spread(seed: int) -> int:

@@ -1,0 +1,126 @@
+"""The reference solver with agents under way: the best completions, and never another beginning."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mtsp_env import Instance, check_tours, makespan, rules, tour_lengths
+from mtsp_env.batched import BatchedMTSP
+from mtsp_env.instance import Tours
+
+pytest.importorskip("numba", reason="needs the extra reference")
+from mtsp_env.reference import improve, improve_batch
+
+points = st.tuples(*[st.integers(0, 3).map(lambda k: k / 3) | st.floats(0, 1)] * 2)  # many coincide
+
+
+@st.composite
+def begun(draw: st.DrawFn, most: int = 12) -> tuple[Instance, Tours, Tours]:
+    """An instance, prefixes of its tours, some of them closed, and tours that begin with them."""
+    instance = Instance(draw(st.lists(points, min_size=2, max_size=most)), draw(st.integers(1, 5)))
+    tours: Tours = [[0] for _ in range(instance.n_agents)]
+    for city in draw(st.permutations(range(1, instance.n_nodes))):
+        tours[draw(st.integers(0, instance.n_agents - 1))].append(city)
+    prefixes = [tour[: draw(st.integers(1, len(tour)))] for tour in tours]
+    tours = [[*tour, 0] for tour in tours]
+    for agent, tour in enumerate(tours):
+        if tour == [*prefixes[agent], 0] and draw(st.booleans()):
+            prefixes[agent] = tour
+    left = set(range(instance.n_nodes)).difference(*prefixes)
+    if left and all(len(prefix) > 1 and prefix[-1] == 0 for prefix in prefixes):
+        prefixes[0] = [0]
+    return instance, prefixes, tours
+
+
+def completions(instance: Instance, prefixes: Tours) -> float:
+    """The least makespan of all tours that begin so, by trying them."""
+    free = sorted(set(range(1, instance.n_nodes)).difference(*prefixes))
+    open_agents = [a for a, prefix in enumerate(prefixes) if not (len(prefix) > 1 and prefix[-1] == 0)]
+    best = np.inf
+    for order in itertools.permutations(free):
+        for agents in itertools.combinations_with_replacement(open_agents, len(order)):
+            tours = [list(prefix) for prefix in prefixes]
+            for city, agent in zip(order, agents, strict=True):
+                tours[agent].append(city)
+            best = min(best, makespan(instance.nodes, [[*tour, 0] for tour in tours]))
+    return best
+
+
+@given(begun(), st.integers(0, 400), st.booleans())
+@settings(max_examples=200, deadline=None)
+def test_tours_begin_with_the_prefixes_and_are_never_made_worse(case, iterations: int, start: bool) -> None:
+    instance, prefixes, tours = case
+    found = improve(instance, tours if start else None, iterations=iterations, prefixes=prefixes)
+    check_tours(instance, found)
+    for prefix, tour in zip(prefixes, found, strict=True):
+        assert tour[: len(prefix)] == prefix
+        assert tour == prefix or len(prefix) == 1 or prefix[-1] != 0  # closed ones stay so
+    if start:
+        assert makespan(instance.nodes, found) <= makespan(instance.nodes, tours)
+
+
+@given(begun(most=7))
+@settings(max_examples=60, deadline=None)
+def test_small_teams_are_completed_as_well_as_can_be(case) -> None:
+    instance, prefixes, _ = case
+    found = improve(instance, iterations=2000, prefixes=prefixes)
+    assert makespan(instance.nodes, found) == pytest.approx(completions(instance, prefixes), abs=1e-9)
+
+
+@pytest.mark.parametrize("tidy", [False, True])
+def test_without_anything_driven_prefixes_change_nothing(tidy: bool) -> None:
+    nodes = np.random.default_rng(0).random((3, 30, 2))
+    free = improve_batch(nodes, 4, 500, tidy=tidy)
+    assert improve_batch(nodes, 4, 500, tidy=tidy, prefixes=[[[0]] * 4] * 3) == free
+
+
+def test_a_plan_is_still_near_optimal_when_its_beginning_is_fixed() -> None:
+    """n = 60, m = 4: the first third of near-optimal tours as prefixes, and the rest is found again within 1 %."""
+    instance = Instance(np.random.default_rng(1).random((60, 2)), 4)
+    plan = improve(instance, iterations=30_000)
+    prefixes = [tour[: len(tour) // 3] for tour in plan]
+    again = improve(instance, iterations=10_000, prefixes=prefixes)
+    assert makespan(instance.nodes, again) <= 1.01 * makespan(instance.nodes, plan)
+    with pytest.raises(ValueError, match="tour 0 must begin with its prefix"):
+        improve(instance, plan, prefixes=[list(reversed(plan[0]))[:3], *prefixes[1:]])
+
+
+def test_games_are_finished_from_any_moment() -> None:
+    """Prefixes are what ``rules.tours`` tells of a game that is not over."""
+    env = BatchedMTSP(12, 3, [16], 0.1, depot="final", seed=0)
+    torch.manual_seed(0)
+    td = env.reset()
+    nodes = td["nodes"].numpy()
+    for _ in range(14):
+        prefixes = [rules.tours(*row, close=False) for row in zip(td["visits"].numpy(), td["destination"].numpy())]
+        found = improve_batch(nodes, 3, 100, prefixes=prefixes)
+        for row, tours, begun_ in zip(nodes, found, prefixes, strict=True):
+            check_tours(Instance(row, 3), tours)
+            assert all(tour[: len(prefix)] == prefix for tour, prefix in zip(tours, begun_, strict=True))
+        td = env.step(env.rand_action(td))["next"]
+    driven = tour_lengths(nodes[0], prefixes[0])
+    assert (driven > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("prefixes", "message"),
+    [
+        ([[0]], "expected 2 prefixes, one per agent, got 1"),
+        ([[0], []], r"prefix 1 must begin at the depot 0, got \[\]"),
+        ([[0], [3]], r"prefix 1 must begin at the depot 0, got \[3\]"),
+        ([[0], [0, 7]], r"prefix 1 visits node 7, outside 0\.\.6"),
+        ([[0, 2], [0, 2]], "city 2 is in the prefixes more than once"),
+        ([[0, 2, 0], [0, 3, 0]], "all agents are home for good, and 4 cities are left"),
+    ],
+)
+def test_bad_prefixes_are_named(square: Instance, prefixes: list, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        improve(square, prefixes=prefixes)
+    with pytest.raises(ValueError, match=message):
+        improve_batch(square.nodes[None], 2, prefixes=[prefixes])
+    with pytest.raises(ValueError, match="expected prefixes for 1 instances, got 2"):
+        improve_batch(square.nodes[None], 2, prefixes=[[[0], [0]]] * 2)
