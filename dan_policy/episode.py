@@ -11,6 +11,8 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
+from mtsp_env.instance import check_count
+
 Decode = Literal["greedy", "sample"]
 EXPLORATION = {"greedy": ExplorationType.DETERMINISTIC, "sample": ExplorationType.RANDOM}
 
@@ -40,8 +42,9 @@ def rollout(
     decode: Decode = "sample",
     nodes: Tensor | None = None,
     keep: tuple[str, ...] = (),
+    most: int | None = None,
 ) -> Episode:
-    """Play every row of ``env`` from a reset to its end.
+    """Play every row of ``env`` from a reset to its end, or for ``most`` decisions.
 
     ``env.rollout(break_when_all_done=True)`` would do the same with more overhead a step and rows that repeat
     themselves after their end.
@@ -52,10 +55,13 @@ def rollout(
         decode: "greedy" takes the likeliest action, "sample" draws one (from torch's global generator).
         nodes: (B, n, 2), instances to replay; None draws fresh ones.
         keep: keys of the observation to keep in ``decisions`` beside ``action``; none: ``decisions`` is None.
+        most: decisions of each row, at least 1; None: until its end.
 
     Raises:
-        ValueError: an unknown ``decode``.
+        ValueError: an unknown ``decode``, or ``most`` below 1.
     """
+    if most is not None:
+        check_count("most", most, minimum=1)
     if decode not in EXPLORATION:
         raise ValueError(f"unknown decode {decode!r}; choose from {sorted(EXPLORATION)}")
     if nodes is None:
@@ -66,7 +72,7 @@ def rollout(
     reward = torch.zeros(env.batch_size, device=env.device)
     over = td["done"][..., 0].clone()
     with set_exploration_type(EXPLORATION[decode]):
-        while not over.all():  # the one wait for the device per decision
+        while len(valid) != most and not over.all():  # the one wait for the device per decision
             td = actor(td)
             if keep:
                 kept.append(td.select(*keep, "action"))

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from states import same
 
-from dan_policy import DANConfig
+from dan_policy import DAN, DANConfig, load, save
 from dan_policy.episode import rollout
 from mtsp_env import check_tours, makespan
 from mtsp_env.instance import Instance
@@ -70,6 +70,27 @@ def test_canonical_tours_solve_the_same_instance_no_worse_in_one_order_whatever_
         assert [t for t in canonical(instance.nodes, turned) if len(t) > 3] == [t for t in found if len(t) > 3]
 
 
+@given(solved(), st.data())
+@settings(max_examples=200, deadline=None)
+def test_canonical_tours_begin_as_they_began(case, data):
+    """Whatever was driven stays; who is still at the depot does not stay there while others have two cities left."""
+    instance, tours = case
+    prefixes = [tour[: data.draw(st.integers(1, len(tour) - 1))] for tour in tours]
+    closed = [len(prefix) > 1 and data.draw(st.booleans()) for prefix in prefixes]
+    prefixes = [tour if home and tour == [*prefix, 0] else prefix
+                for tour, prefix, home in zip(tours, prefixes, closed, strict=True)]  # fmt: skip
+    found = canonical(instance.nodes, tours, prefixes)
+    check_tours(instance, found)
+    assert makespan(instance.nodes, found) <= makespan(instance.nodes, tours) + 1e-12
+    assert all(tour[: len(prefix)] == prefix for tour, prefix in zip(found, prefixes, strict=True))
+    waiting = [tour for tour, prefix in zip(found, prefixes, strict=True) if prefix == [0]]
+    if [0, 0] in waiting:
+        assert all(len(tour) <= 3 for tour in waiting)
+        assert all(tour[-1:] == [0] and len(tour) <= len(prefix) + 1 for tour, prefix in zip(found, prefixes)
+                   if len(prefix) > 1)  # fmt: skip
+        assert waiting.index([0, 0]) == sum(tour != [0, 0] for tour in waiting)  # the idle ones come last
+
+
 def test_tours_run_counter_clockwise_and_agents_go_by_angle():
     """The depot in the middle of a square of eight; west is where angles begin and end."""
     nodes = np.array([[0.5, 0.5], [1, 0.6], [0.6, 1], [0.4, 1], [0, 0.6], [0, 0.4], [0.4, 0], [0.6, 0], [1, 0.4]])
@@ -120,11 +141,49 @@ def replayed_rewards(shown, config):
     return rollout(follow(shown), env, "greedy", torch.as_tensor(shown.nodes)).reward
 
 
-def test_workers_make_the_same_sets():
+@pytest.fixture
+def student(tmp_path):
+    """A network that has learnt nothing, and a run in which it plays the beginnings."""
+    torch.manual_seed(3)
+    save(tmp_path / "student.safetensors", DAN(TINY.network))
+    return replace(TINY, roll_in=str(tmp_path / "student.safetensors"))
+
+
+def test_the_student_plays_the_beginning_and_the_teacher_goes_on(student):
+    begun = set()
+    for index in range(12):
+        shown = demonstrate(student, index)
+        decisions, valid = replay(shown, student)
+        assert 0 <= shown.begin < shown.nodes.shape[1] - 1 and valid[: shown.begin].all()
+        logits = load(student.roll_in)(decisions["cities"], decisions["agents"], decisions["visited"])
+        likeliest = logits.masked_fill(~decisions["action_mask"], -torch.inf).argmax(-1)
+        same_choice = (likeliest == decisions["action"]) | ~valid
+        assert same_choice[: shown.begin].all()
+        assert not same_choice[shown.begin :].all()
+        begun.add(shown.begin)
+        costs = -replayed_rewards(shown, student)
+        played = -play(load(student.roll_in), Instances(torch.tensor(shown.nodes), shown.first.shape[1]), student,
+                       "greedy").reward  # fmt: skip
+        assert (costs <= 1.01 * played).all()  # from there on as well as can be; tidy tours may give a little away
+    assert len(begun) > 3
+
+
+def test_what_comes_after_the_students_part_is_learnt_from(student):
+    for passes in (1.0, 0.25):
+        buffer = Buffer(replace(student, passes=passes, rows=1, buffer=1), np.random.default_rng(0))
+        for index in range(6):
+            begin = demonstrate(student, index).begin
+            buffer._add(index)
+            (steps, (_, valid)) = buffer.left.pop(), buffer.sets.pop()
+            count = max(1, round(passes * len(valid)))
+            assert sorted(steps) == list(range(begin, min(len(valid), begin + count)))
+
+
+def test_workers_make_the_same_sets(student):
     """Set i from another process is set i."""
     rows = []
     for workers in (0, 1):
-        buffer = Buffer(replace(TINY, workers=workers), np.random.default_rng(0))
+        buffer = Buffer(replace(student, workers=workers), np.random.default_rng(0))
         rows.append(torch.cat([row["cities"].flatten() for _ in range(3) for row in buffer.draw(2)]))
         buffer.close()
     assert torch.equal(*rows)
@@ -150,8 +209,8 @@ def test_the_learning_rate_warms_up_and_falls_to_its_end():
     assert rates[:10] == sorted(rates[:10]) and rates[10:] == sorted(rates[10:], reverse=True)
 
 
-def test_resume_is_bit_identical(tmp_path, monkeypatch):
-    imitate(replace(TINY, out=tmp_path / "whole"))
+def test_resume_is_bit_identical(tmp_path, monkeypatch, student):
+    imitate(replace(student, out=tmp_path / "whole"))
 
     def interrupted(self):
         logs = train_step(self)
@@ -161,9 +220,9 @@ def test_resume_is_bit_identical(tmp_path, monkeypatch):
 
     train_step = Imitator.train_step
     monkeypatch.setattr(Imitator, "train_step", interrupted)
-    assert imitate(replace(TINY, out=tmp_path / "parts")).step == 7
+    assert imitate(replace(student, out=tmp_path / "parts")).step == 7
     torch.manual_seed(123)  # whatever happened in between
-    assert imitate(replace(TINY, out=tmp_path / "parts", resume=True)).step == 24
+    assert imitate(replace(student, out=tmp_path / "parts", resume=True)).step == 24
     whole, parts = (checkpoint.read(tmp_path / name / "checkpoint.pt") for name in ("whole", "parts"))
     for key in ("network", "average", "optimiser", "schedule", "buffer"):
         assert same(whole[key], parts[key]), key

@@ -119,8 +119,13 @@ class Buffer:
         return rows
 
     def _add(self, index: int) -> None:
-        decisions, valid = replay(self._made(index), self.config)
-        steps = self.rng.permutation(len(valid))[: max(1, round(self.config.passes * len(valid)))]
+        demonstrations = self._made(index)
+        decisions, valid = replay(demonstrations, self.config)
+        count = max(1, round(self.config.passes * len(valid)))
+        if self.config.roll_in is None:
+            steps = self.rng.permutation(len(valid))[:count]
+        else:  # where the student's mistakes still show
+            steps = self.rng.permutation(np.arange(demonstrations.begin, len(valid))[:count])
         self.indices.append(index)
         self.left.append(steps.tolist())
         self.sets.append((decisions, valid))
