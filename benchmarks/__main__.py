@@ -1,4 +1,4 @@
-"""``python -m benchmarks {run,report,best,aims,speed,ablations,curves}``."""
+"""``python -m benchmarks {run,report,best,aims,speed,clip,ablations,curves}``."""
 
 from __future__ import annotations
 
@@ -177,6 +177,32 @@ def speed(
     from benchmarks import speed as module
 
     module.main(device, seconds)
+
+
+@app.command
+def clip(
+    sizes: tuple[str, ...] = (),
+    instances: int = 6,
+    samples: int = 64,
+    policy: str = "default",
+    augment: bool = False,
+    out: Path | None = None,
+) -> None:
+    """Makespans of samples over C, how surely they are drawn, on instances of no test: results/clip.md.
+
+    Args:
+        sizes: such as 50x5; none: five from 50x5 to 200x10.
+        instances: of each size, at least 2.
+        samples: of each plan.
+        policy: a shipped model or a file of weights.
+        augment: see the instances in the square's eight symmetries.
+        out: file for the table; none: benchmarks/results/clip.md.
+    """
+    from benchmarks import clip as module
+
+    given = {"sizes": sizes} if sizes else {}
+    given |= {"out": out} if out else {}
+    module.main(instances=instances, samples=samples, policy=policy, augment=augment, **given)
 
 
 @app.command

@@ -86,8 +86,8 @@ def test_canonical_tours_begin_as_they_began(case, data):
     waiting = [tour for tour, prefix in zip(found, prefixes, strict=True) if prefix == [0]]
     if [0, 0] in waiting:
         assert all(len(tour) <= 3 for tour in waiting)
-        assert all(tour[-1:] == [0] and len(tour) <= len(prefix) + 1 for tour, prefix in zip(found, prefixes)
-                   if len(prefix) > 1)  # fmt: skip
+        under_way = [pair for pair in zip(found, prefixes, strict=True) if len(pair[1]) > 1]
+        assert all(len(tour) <= len(prefix) + 1 for tour, prefix in under_way)  # nothing left to take over
         assert waiting.index([0, 0]) == sum(tour != [0, 0] for tour in waiting)  # the idle ones come last
 
 

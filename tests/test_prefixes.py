@@ -96,7 +96,8 @@ def test_games_are_finished_from_any_moment() -> None:
     td = env.reset()
     nodes = td["nodes"].numpy()
     for _ in range(14):
-        prefixes = [rules.tours(*row, close=False) for row in zip(td["visits"].numpy(), td["destination"].numpy())]
+        states = zip(td["visits"].numpy(), td["destination"].numpy(), strict=True)
+        prefixes = [rules.tours(*state, close=False) for state in states]
         found = improve_batch(nodes, 3, 100, prefixes=prefixes)
         for row, tours, begun_ in zip(nodes, found, prefixes, strict=True):
             check_tours(Instance(row, 3), tours)

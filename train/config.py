@@ -212,9 +212,9 @@ class ImitateConfig(RunConfig):
     passes: float = 1.0
     """Share of a set's decision indices that are learnt from before it gives way to a fresh one, at most 1."""
     roll_in: str | None = None
-    """Weights of a student, a file or a shipped model's name, that plays the beginning of each game, for a random number
-    of decisions: the teacher shows how to go on from there (DAgger), and of `passes` the next decisions are learnt
-    from. None: the teacher plays all of it."""
+    """Weights of a student, a file or a shipped model's name, that plays the beginning of each game, for a random
+    number of decisions; the teacher shows how to go on from there (DAgger), and the next decisions are learnt from, the
+    share `passes` of a set's. None: the teacher plays all of it."""
     rows: int = 4
     """Rows per optimiser step."""
     teacher_iterations: int = 80
