@@ -32,6 +32,7 @@ except ModuleNotFoundError as error:
         "mtsp_env.reference needs Numba: pip install 'mtsp-env[reference]'", name="numba"
     ) from error
 
+from mtsp_env._search import as_order, as_tours, is_closed, new_search, rest_as_order, set_off
 from mtsp_env.instance import Instance, Tours, check_count, check_nodes
 from mtsp_env.tours import check_tours, farthest_trip, makespan, tour_lengths
 
@@ -87,7 +88,7 @@ def improve(
         check_tours(instance, tours)
         tours = [[int(node) for node in tour] for tour in tours]
         for agent, (tour, prefix) in enumerate(zip(tours, prefixes or [], strict=False)):
-            if tour[: len(prefix)] != prefix or (_closed(prefix) and tour != prefix):
+            if tour[: len(prefix)] != prefix or (is_closed(prefix) and tour != prefix):
                 raise ValueError(f"tour {agent} must begin with its prefix {prefix}, got {tour}")
     compile_kernels()
     found = _solve(instance.nodes, instance.n_agents, tours, seconds, iterations, seed, prefixes=prefixes)
@@ -163,14 +164,9 @@ def _check_prefixes(n_nodes: int, n_agents: int, prefixes: Sequence[Sequence[int
             if node and node in seen:
                 raise ValueError(f"city {node} is in the prefixes more than once")
             seen.add(node)
-    if len(seen) < n_nodes and all(map(_closed, prefixes)):
+    if len(seen) < n_nodes and all(map(is_closed, prefixes)):
         raise ValueError(f"all agents are home for good, and {n_nodes - len(seen)} cities are left")
     return prefixes
-
-
-def _closed(prefix: Sequence[int]) -> bool:
-    """Whether an agent whose tour begins so is home for good."""
-    return len(prefix) > 1 and prefix[-1] == 0
 
 
 def _usable_cores() -> int:
@@ -201,24 +197,24 @@ def _solve(
     enough = farthest_trip(nodes)  # lower_bound's other part, the spanning tree, is never attained
     if prefixes is None:
         # More agents than cities are of no use
-        search = _new_search(nodes, min(n_agents, len(nodes) - 1), seed)
-        start = None if tours is None else _as_order(tours, len(search.best) - 1)
+        search = new_search(nodes, min(n_agents, len(nodes) - 1), seed)
+        start = None if tours is None else as_order(tours, len(search.best) - 1)
         _optimise(search, 1, start, enough, tidy, seconds, iterations, started)
-        return _as_tours(_sisr.best_order(search), n_agents)
+        return as_tours(_sisr.best_order(search), n_agents)
 
     heads = [prefix[-1] for prefix in prefixes if prefix[-1] != 0]
     free = sorted(set(range(1, len(nodes))).difference(*prefixes))
     if not free:
-        return [prefix if _closed(prefix) else [*prefix, 0] for prefix in prefixes]
+        return [prefix if is_closed(prefix) else [*prefix, 0] for prefix in prefixes]
     kept = [0, *heads, *free]  # what is left of the instance; its nodes are numbered anew
-    search = _new_search(nodes[kept], n_agents, seed)
-    _set_off(search, prefixes, tour_lengths(nodes, prefixes))
+    search = new_search(nodes[kept], n_agents, seed)
+    set_off(search, prefixes, tour_lengths(nodes, prefixes))
     enough = max(enough, _sisr.sum_lengths(search))  # of everybody going home at once
-    start = None if tours is None else _rest_as_order(tours, prefixes, kept)
+    start = None if tours is None else rest_as_order(tours, prefixes, kept)
     _optimise(search, 1 + len(heads), start, enough, tidy, seconds, iterations, started)
-    rest = _as_tours(_sisr.best_order(search), n_agents)
+    rest = as_tours(_sisr.best_order(search), n_agents)
     return [
-        prefix if _closed(prefix) else [*prefix, *(kept[node] for node in tour[1 if prefix == [0] else 2 :])]
+        prefix if is_closed(prefix) else [*prefix, *(kept[node] for node in tour[1 if prefix == [0] else 2 :])]
         for prefix, tour in zip(prefixes, rest, strict=True)
     ]
 
@@ -290,84 +286,3 @@ def _anneal(
             before, now = now, time.perf_counter()
             per_iteration = max((now - before) / turn, 1e-7)  # a coarse clock may not have moved
             done += turn
-
-
-def _new_search(nodes: np.ndarray, n_agents: int, seed: int) -> _sisr.Search:
-    """A search over ``nodes`` (n, 2) whose tours are empty."""
-    n, size = len(nodes), len(nodes) + n_agents
-    xy = np.concatenate([nodes, np.repeat(nodes[:1], n_agents, axis=0)])  # (N, 2)
-    x, y = np.ascontiguousarray(xy[:, 0]), np.ascontiguousarray(xy[:, 1])
-    near, near_distance = _sisr.nearest_cities(x, y, n, min(_sisr.N_NEAR, n - 2))
-    itself = np.arange(size, dtype=np.int32)  # an empty tour: the depot before and after itself
-    return _sisr.Search(
-        x=x,
-        y=y,
-        near=near,
-        near_distance=near_distance,
-        previous=itself,
-        next=itself.copy(),
-        leg=np.zeros(size),
-        tour=np.maximum(itself - n, -1),
-        length=np.zeros(n_agents),
-        count=np.zeros(n_agents, np.int32),
-        head=np.zeros(n_agents, np.int32),
-        driven=np.zeros(n_agents),
-        ruined=np.zeros(n_agents, np.int64),
-        best=itself.copy(),
-        random=np.array([_spread(seed)], np.uint64),
-        city_log=np.zeros((2, n), np.int32),
-        place_log=np.zeros(n, np.int32),
-        tour_log=np.zeros((2, n), np.int32),
-        length_log=np.zeros((2, n)),
-        key=np.zeros(n),
-    )
-
-
-def _set_off(search: _sisr.Search, prefixes: Tours, driven: np.ndarray) -> None:
-    """Put the agents where their ``prefixes`` end: nodes 1, 2, ... of ``search`` are the last ones that are cities."""
-    depot, head, order = len(search.near), 1, []
-    for agent, prefix in enumerate(prefixes):
-        if prefix[-1] != 0:
-            search.head[agent] = head
-            order.append(head)
-            head += 1
-        elif _closed(prefix):
-            search.head[agent] = depot + agent
-        order.append(0)
-    search.driven[:] = driven
-    _sisr.load_tours(search, np.array(order, dtype=np.int64))
-
-
-def _rest_as_order(tours: Tours, prefixes: Tours, kept: list[int]) -> np.ndarray:
-    """What is left of ``tours``, which begin with ``prefixes``, as ``_sisr.load_tours`` takes it."""
-    number = {node: i for i, node in enumerate(kept)}
-    rests = [tour[max(0, len(prefix) - 1) :] for tour, prefix in zip(tours, prefixes, strict=True)]
-    return np.array([i for rest in rests for i in [*(number[node] for node in rest if node != 0), 0]], dtype=np.int64)
-
-
-def _spread(seed: int) -> int:
-    """Neighbouring seeds, spread over 64 bits (splitmix64); never 0."""
-    z = (seed + 0x9E3779B97F4A7C15) % 2**64
-    z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9 % 2**64
-    z = (z ^ (z >> 27)) * 0x94D049BB133111EB % 2**64
-    return (z ^ (z >> 31)) | 1
-
-
-def _as_order(tours: Tours, size: int) -> np.ndarray:
-    """``tours`` as ``_sisr.load_tours`` takes them, int64 (size,): idle agents last.
-
-    Passing the depot in between only makes a tour longer, so it is left out.
-    """
-    cities = [[node for node in tour if node != 0] for tour in tours]
-    order = [node for tour in cities if tour for node in [*tour, 0]]
-    return np.array(order + [0] * (size - len(order)), dtype=np.int64)
-
-
-def _as_tours(order: np.ndarray, n_agents: int) -> Tours:
-    """Tours from ``_sisr.best_order``; agents that it leaves out stay at home."""
-    tours: Tours = [[0]]
-    for node in order.tolist():
-        tours[-1].append(node)
-        if node == 0:
-            tours.append([0])
-    return tours[:-1] + [[0, 0] for _ in range(n_agents - len(tours) + 1)]

@@ -17,7 +17,7 @@ from mtsp_env import Instance, check_tours, clustered, lower_bound, makespan, to
 from mtsp_env.instance import Tours
 
 pytest.importorskip("numba", reason="needs the extra reference")
-from mtsp_env import _sisr, reference
+from mtsp_env import _search, _sisr, reference
 from mtsp_env.reference import COLD, HOT, improve, improve_batch
 
 ROOT = Path(__file__).parents[1]
@@ -293,15 +293,15 @@ def test_lengths_are_kept_as_the_judge_finds_them(n: int, m: int, hot: float, we
         return lengths.max() + weight * lengths.sum()
 
     instance = random_instance(10, n, m)
-    search = reference._new_search(instance.nodes, m, seed=1)
+    search = _search.new_search(instance.nodes, m, seed=1)
     _sisr.insert_greedily(search, np.arange(1, n))
     best, objective = _sisr.sum_lengths(search) + weight * search.length.sum(), math.inf
     for _ in range(10):
         best = _sisr.anneal(search, 300, hot, hot, best, -1.0, weight)
-        assert score(reference._as_tours(_sisr.best_order(search), m)) == pytest.approx(best)
+        assert score(_search.as_tours(_sisr.best_order(search), m)) == pytest.approx(best)
 
         now = search._replace(best=search.next)
-        tours = reference._as_tours(_sisr.best_order(now), m)
+        tours = _search.as_tours(_sisr.best_order(now), m)
         check_tours(instance, tours)
         assert search.length == pytest.approx(tour_lengths(instance.nodes, tours), abs=1e-10)
         assert search.count.tolist() == [len(tour) - 2 for tour in tours]
@@ -313,11 +313,11 @@ def test_lengths_are_kept_as_the_judge_finds_them(n: int, m: int, hot: float, we
 
 def test_tours_are_loaded_as_given() -> None:
     """But for idle agents, who come last, and for depots in between, which are left out; whatever was there before."""
-    search = reference._new_search(np.random.default_rng(0).random((6, 2)), 4, seed=0)
+    search = _search.new_search(np.random.default_rng(0).random((6, 2)), 4, seed=0)
     _sisr.insert_greedily(search, np.arange(1, 6))
     tours = [[0, 0], [0, 3, 0, 0, 1, 0], [0, 0], [0, 5, 2, 4, 0]]
-    _sisr.load_tours(search, reference._as_order(tours, 5 + 4))
-    assert reference._as_tours(_sisr.best_order(search), 5) == [[0, 3, 1, 0], [0, 5, 2, 4, 0], [0, 0], [0, 0], [0, 0]]
+    _sisr.load_tours(search, _search.as_order(tours, 5 + 4))
+    assert _search.as_tours(_sisr.best_order(search), 5) == [[0, 3, 1, 0], [0, 5, 2, 4, 0], [0, 0], [0, 0], [0, 0]]
     assert _sisr.sum_lengths(search) == pytest.approx(
         makespan(np.stack([search.x, search.y], 1)[:6], [[0, 3, 1, 0], tours[3]])
     )

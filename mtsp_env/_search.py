@@ -1,0 +1,99 @@
+"""A search of the reference solver: its arrays from an instance, from tours and from prefixes, and tours from them.
+
+``mtsp_env._sisr`` holds what is compiled, ``mtsp_env.reference`` what is called.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mtsp_env import _sisr
+from mtsp_env.instance import Tours
+
+
+def new_search(nodes: np.ndarray, n_agents: int, seed: int) -> _sisr.Search:
+    """A search over ``nodes`` (n, 2) whose tours are empty."""
+    n, size = len(nodes), len(nodes) + n_agents
+    xy = np.concatenate([nodes, np.repeat(nodes[:1], n_agents, axis=0)])  # (N, 2)
+    x, y = np.ascontiguousarray(xy[:, 0]), np.ascontiguousarray(xy[:, 1])
+    near, near_distance = _sisr.nearest_cities(x, y, n, min(_sisr.N_NEAR, n - 2))
+    itself = np.arange(size, dtype=np.int32)  # an empty tour: the depot before and after itself
+    return _sisr.Search(
+        x=x,
+        y=y,
+        near=near,
+        near_distance=near_distance,
+        previous=itself,
+        next=itself.copy(),
+        leg=np.zeros(size),
+        tour=np.maximum(itself - n, -1),
+        length=np.zeros(n_agents),
+        count=np.zeros(n_agents, np.int32),
+        head=np.zeros(n_agents, np.int32),
+        driven=np.zeros(n_agents),
+        ruined=np.zeros(n_agents, np.int64),
+        best=itself.copy(),
+        random=np.array([_spread(seed)], np.uint64),
+        city_log=np.zeros((2, n), np.int32),
+        place_log=np.zeros(n, np.int32),
+        tour_log=np.zeros((2, n), np.int32),
+        length_log=np.zeros((2, n)),
+        key=np.zeros(n),
+    )
+
+
+def set_off(search: _sisr.Search, prefixes: Tours, driven: np.ndarray) -> None:
+    """Put the agents where their ``prefixes`` end: nodes 1, 2, ... of ``search`` are the last ones that are cities."""
+    depot, head, order = len(search.near), 1, []
+    for agent, prefix in enumerate(prefixes):
+        if prefix[-1] != 0:
+            search.head[agent] = head
+            order.append(head)
+            head += 1
+        elif is_closed(prefix):
+            search.head[agent] = depot + agent
+        order.append(0)
+    search.driven[:] = driven
+    _sisr.load_tours(search, np.array(order, dtype=np.int64))
+
+
+def rest_as_order(tours: Tours, prefixes: Tours, kept: list[int]) -> np.ndarray:
+    """What is left of ``tours``, which begin with ``prefixes``, as ``_sisr.load_tours`` takes it."""
+    number = {node: i for i, node in enumerate(kept)}
+    rests = [tour[max(0, len(prefix) - 1) :] for tour, prefix in zip(tours, prefixes, strict=True)]
+    return np.array([i for rest in rests for i in [*(number[node] for node in rest if node != 0), 0]], dtype=np.int64)
+
+
+def _spread(seed: int) -> int:
+    """Neighbouring seeds, spread over 64 bits (splitmix64); never 0."""
+    z = (seed + 0x9E3779B97F4A7C15) % 2**64
+    z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9 % 2**64
+    z = (z ^ (z >> 27)) * 0x94D049BB133111EB % 2**64
+    return (z ^ (z >> 31)) | 1
+
+
+def as_order(tours: Tours, size: int) -> np.ndarray:
+    """``tours`` as ``_sisr.load_tours`` takes them, int64 (size,): idle agents last.
+
+    Passing the depot in between only makes a tour longer, so it is left out.
+    """
+    cities = [[node for node in tour if node != 0] for tour in tours]
+    order = [node for tour in cities if tour for node in [*tour, 0]]
+    return np.array(order + [0] * (size - len(order)), dtype=np.int64)
+
+
+def as_tours(order: np.ndarray, n_agents: int) -> Tours:
+    """Tours from ``_sisr.best_order``; agents that it leaves out stay at home."""
+    tours: Tours = [[0]]
+    for node in order.tolist():
+        tours[-1].append(node)
+        if node == 0:
+            tours.append([0])
+    return tours[:-1] + [[0, 0] for _ in range(n_agents - len(tours) + 1)]
+
+
+def is_closed(prefix: Sequence[int]) -> bool:
+    """Whether an agent whose tour begins so is home for good."""
+    return len(prefix) > 1 and prefix[-1] == 0

@@ -1,0 +1,24 @@
+"""Random games of the PettingZoo environment."""
+
+from __future__ import annotations
+
+import numpy as np
+import pettingzoo
+
+
+def random_action(env: pettingzoo.AECEnv, rng: np.random.Generator) -> int:
+    return int(rng.choice(np.flatnonzero(env.observe(env.agent_selection)["action_mask"])))
+
+
+def over(env: pettingzoo.AECEnv) -> bool:
+    return any(env.terminations.values()) or any(env.truncations.values())
+
+
+def play(env: pettingzoo.AECEnv, seed: int = 0) -> list[tuple]:
+    """Random legal actions until the episode is over; what was seen, and done, and paid."""
+    rng, story = np.random.default_rng(seed), []
+    while not over(env):
+        seen, agent, action = env.observe(env.agent_selection), env.agent_selection, random_action(env, rng)
+        env.step(action)
+        story.append((agent, seen, action, dict(env.rewards)))
+    return story
