@@ -25,8 +25,9 @@ from dan_policy.episode import Decode, rollout
 from dan_policy.solution import SPEED
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.tours import makespan
-from train.config import REFINE, ImitateConfig
+from train.config import ImitateConfig
 from train.imitate import Imitator, imitate
+from train.presets import REFINE
 from train.reinforce import reinforce
 
 REPORT = Path(__file__).parent / "results" / "ablations.md"

@@ -16,9 +16,10 @@ from mtsp_env.reference import improve_batch
 from mtsp_env.tours import makespan
 from train import checkpoint
 from train.collect import draw_set
-from train.config import QUICK, ImitateConfig, RunConfig
+from train.config import ImitateConfig, RunConfig
 from train.imitate import imitate
 from train.learner import VALIDATION_SEED, checkpoint_path
+from train.presets import QUICK
 from train.reinforce import reinforce
 
 RESULTS = Path(__file__).parent / "results"

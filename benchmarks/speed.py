@@ -18,7 +18,7 @@ from dan_policy import DAN, DANConfig, load, make_actor, rollout
 from dan_policy.episode import find_device
 from mtsp_env import mtsp_v0
 from mtsp_env.batched import BatchedMTSP
-from train.config import QUICK
+from train.presets import QUICK
 from train.reinforce import Trainer
 
 

@@ -17,9 +17,10 @@ from torch.utils.flop_counter import FlopCounterMode
 from benchmarks.speed import machine, matmul_rate, per_second, wait_for
 from dan_policy.episode import find_device
 from train.collect import draw, play, repeat
-from train.config import REFINE, ImitateConfig
+from train.config import ImitateConfig
 from train.demonstrations import demonstrate
 from train.imitate import Imitator
+from train.presets import REFINE
 from train.reinforce import Trainer
 
 SIZES = ((20, 3), (50, 5), (100, 10), (200, 20))

@@ -8,7 +8,7 @@ import torch
 from dan_policy import DAN, DANConfig, load, save
 from dan_policy.weights import load_extra
 from train.__main__ import main
-from train.config import REFINE
+from train.presets import REFINE
 from train.reinforce import reinforce
 
 SMALL = DANConfig(embed_dim=16, feedforward_dim=32, n_heads=2, city_layers=1)

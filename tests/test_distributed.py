@@ -12,8 +12,8 @@ import torch
 from dan_policy import DAN, DANConfig, make_actor
 from train import checkpoint, distributed
 from train.collect import draw, play
-from train.config import QUICK
 from train.loss import EpisodicReinforceLoss, backward, decisions_with_advantage
+from train.presets import QUICK
 
 ROOT = Path(__file__).parent.parent
 TINY = replace(QUICK, n_nodes=(6, 6), n_agents=(2, 2), network=DANConfig(embed_dim=16, feedforward_dim=16, n_heads=2))

@@ -12,7 +12,8 @@ import torch
 from benchmarks import ablations, best, curves
 from benchmarks.policies import nearest
 from benchmarks.suite import SEED, Cell
-from train.config import QUICK, REFINE, ImitateConfig
+from train.config import ImitateConfig
+from train.presets import QUICK, REFINE
 
 CELL = Cell(50, 5, 3)
 

@@ -9,7 +9,7 @@ import torch
 
 from dan_policy import DAN, DANConfig
 from train.collect import draw, play
-from train.config import QUICK
+from train.presets import QUICK
 from train.reinforce import reinforce
 from train.remote import RayWorkers, play_part, replay
 

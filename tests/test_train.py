@@ -18,8 +18,9 @@ from train import checkpoint
 from train.__main__ import main
 from train.baseline import RolloutBaseline, SharedBaseline, better
 from train.collect import Instances, costs, draw, draw_set, play, repeat
-from train.config import PAPER, QUICK, ReinforceConfig, check_same_run
+from train.config import ReinforceConfig, check_same_run
 from train.loss import EpisodicReinforceLoss, backward, decisions_with_advantage, log_probs, subsample
+from train.presets import PAPER, QUICK
 from train.reinforce import Trainer, reinforce
 
 TINY = replace(

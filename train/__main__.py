@@ -13,8 +13,9 @@ os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "8192")
 import tyro
 
 from train.average import average, validate
-from train.config import PRESETS, REFINE, ImitateConfig, RunConfig
+from train.config import ImitateConfig, RunConfig
 from train.imitate import imitate
+from train.presets import PRESETS, REFINE
 from train.reinforce import reinforce
 
 Preset = tyro.extras.subcommand_type_from_defaults(
