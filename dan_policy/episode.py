@@ -40,7 +40,7 @@ def rollout(
     actor: nn.Module,
     env: EnvBase,
     decode: Decode = "sample",
-    nodes: Tensor | None = None,
+    nodes: Tensor | TensorDictBase | None = None,
     keep: tuple[str, ...] = (),
     most: int | None = None,
 ) -> Episode:
@@ -53,7 +53,7 @@ def rollout(
         actor: reads the observation and writes ``action``, as ``make_actor`` builds it.
         env: a TorchRL environment of batch size [B] whose episodes end by themselves.
         decode: "greedy" takes the likeliest action, "sample" draws one (from torch's global generator).
-        nodes: (B, n, 2), instances to replay; None draws fresh ones.
+        nodes: (B, n, 2), instances to replay, or a TensorDict of whole states to go on from; None draws fresh ones.
         keep: keys of the observation to keep in ``decisions`` beside ``action``; none: ``decisions`` is None.
         most: decisions of each row, at least 1; None: until its end.
 
@@ -64,10 +64,9 @@ def rollout(
         check_count("most", most, minimum=1)
     if decode not in EXPLORATION:
         raise ValueError(f"unknown decode {decode!r}; choose from {sorted(EXPLORATION)}")
-    if nodes is None:
-        td = env.reset()
-    else:
-        td = env.reset(TensorDict({"nodes": nodes}, batch_size=env.batch_size, device=env.device), set_state=True)
+    if isinstance(nodes, Tensor):
+        nodes = TensorDict({"nodes": nodes}, batch_size=env.batch_size, device=env.device)
+    td = env.reset() if nodes is None else env.reset(nodes, set_state=True)
     kept, valid = [], []
     reward = torch.zeros(env.batch_size, device=env.device)
     over = td["done"][..., 0].clone()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
@@ -12,7 +12,8 @@ from typing import Literal, get_args
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from tensordict import TensorDict
+from torch import nn
 
 from dan_policy.actor import make_actor
 from dan_policy.episode import Decode, find_device, rollout
@@ -22,7 +23,7 @@ from dan_policy.weights import find, load
 from mtsp_env import rules
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.instance import Instance, Tours, check_count
-from mtsp_env.tours import check_tours, makespan
+from mtsp_env.tours import check_prefixes, check_tours, makespan
 
 Precision = Literal["auto", "float32", "bfloat16"]
 SPEED = 0.01  # the paper's Delta g in tests (Sec. 6)
@@ -58,10 +59,12 @@ def solve(
     precision: Precision = "auto",
     augment: bool = False,
     clip: float | None = None,
+    prefixes: Sequence[Sequence[int]] | None = None,
 ) -> Solution:
     """Plan the team's tours with a policy (paper, Sec. 6: DAN(g.) and DAN(s.64)), and polish them where asked to.
 
-    The games are played with the depot rule "final", so that tours are complete whatever the policy does.
+    The games are played with the depot rule "final", so that tours are complete whatever the policy does. With
+    ``prefixes`` they go on from there: for who has to replan a team that is under way.
 
     Args:
         policy: the name of a shipped model, a file that ``dan_policy.save`` wrote, a ``DAN``, or any actor built by
@@ -80,6 +83,8 @@ def solve(
         clip: C to sample with, above 0: the larger, the surer the likelier actions are drawn. None: ``sample_clip``.
         augment: the games see the instance in the square's eight symmetries in turn, and the best counts (Kwon et al.
             2020, POMO): "greedy" plays eight games instead of one, "sample" as many as without.
+        prefixes: how each agent's tour begins (``mtsp_env.tours.check_prefixes``); None: all are at the depot. Each is
+            driven at once, and whoever is first at the end of its prefix decides first.
 
     Raises:
         ImportError: ``improve`` without Numba.
@@ -93,7 +98,8 @@ def solve(
         raise ValueError(f"unknown precision {precision!r}; choose from {list(get_args(Precision))}")
     if clip is not None and not clip > 0:
         raise ValueError(f"clip must be above 0, got {clip!r}")
-    polish = None if improve is None else _polish(improve, seed)
+    prefixes = None if prefixes is None else check_prefixes(instance, prefixes)
+    polish = None if improve is None else _polish(improve, seed, prefixes)
     device = find_device(device)
     policy = _ready(policy, device)
     if decode == "sample" and isinstance(policy, DAN):
@@ -106,12 +112,14 @@ def solve(
 
     start = time.perf_counter()
     with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"):
-        if rows == 1 and decode == "greedy" and isinstance(policy, DAN) and device.type == "cpu":
-            tours = _play_alone(policy, instance)
+        game = rules.make_rules(instance.n_nodes, instance.n_agents, SPEED, "final", "sparse", None)
+        state = _set_out(instance, game, prefixes or [])
+        if rules.all_visited(state)[0]:
+            tours = rules.tours(state.visits[0], state.destination[0])
+        elif rows == 1 and decode == "greedy" and isinstance(policy, DAN) and device.type == "cpu":
+            tours = _play_alone(policy, state, game)
         else:
-            nodes = torch.as_tensor(instance.nodes.copy(), device=device)
-            nodes = views(nodes, rows) if augment else nodes.expand(rows, -1, -1)
-            tours = _play(policy, nodes, instance.n_agents, decode, seed)
+            tours = _play(policy, _side_by_side(state, rows, augment, device), decode, seed)
     if polish is not None:
         tours = polish(instance, tours)
     seconds = time.perf_counter() - start
@@ -131,33 +139,48 @@ def _multiplies_bfloat16(device: torch.device) -> bool:
     return device.type == "cpu" and bool(getattr(torch.cpu, "get_capabilities", dict)().get("amx_bf16"))
 
 
-def _polish(seconds: float, seed: int) -> Callable[[Instance, Tours], Tours]:
+def _polish(seconds: float, seed: int, prefixes: Tours | None) -> Callable[[Instance, Tours], Tours]:
     """The reference solver for so many seconds, ready to start."""
     from mtsp_env import reference  # Numba: only where it is needed
 
     reference.check_seconds("improve", seconds)
     check_count("seed", seed, minimum=0)
     reference.compile_kernels()
-    return partial(reference.improve, seconds=seconds, seed=seed)
+    return partial(reference.improve, seconds=seconds, seed=seed, prefixes=prefixes)
 
 
-def _play(policy: nn.Module, nodes: Tensor, n_agents: int, decode: Decode, seed: int) -> Tours:
-    """The best game on ``nodes`` (rows, n, 2), which are all the same instance: side by side."""
+def _set_out(instance: Instance, game: rules.Rules, prefixes: Tours) -> rules.State:
+    """The moment (one row of NumPy arrays) when all ``prefixes`` are driven, by the game's own rules and clock."""
+    state, left = rules.start(instance.nodes[None], instance.n_agents), [prefix[1:] for prefix in prefixes]
+    while any(left):
+        agent = min((a for a in range(len(left)) if left[a]), key=lambda a: (state.ready[0, a], a))
+        action, *left[agent] = left[agent]
+        state = rules.depart(state._replace(agent=np.array([agent])), game, np.array([action]))
+    return state._replace(agent=rules.agent_to_decide(state.ready))
+
+
+def _side_by_side(state: rules.State, rows: int, augment: bool, device: torch.device) -> TensorDict:
+    """The same state in so many rows, as the batched environment takes it; in the square's symmetries in turn."""
+    parts = {name: torch.tensor(part, device=device) for name, part in state._asdict().items()}
+    many = TensorDict(parts, batch_size=[1], device=device).expand(rows).contiguous()
+    return many.set("nodes", views(parts["nodes"][0], rows)) if augment else many
+
+
+def _play(policy: nn.Module, start: TensorDict, decode: Decode, seed: int) -> Tours:
+    """The best game from ``start``, whose rows are all the same state."""
     actor = make_actor(policy) if isinstance(policy, DAN) else policy
-    rows, n_nodes, device = *nodes.shape[:2], nodes.device
+    (rows, n_nodes), n_agents, device = start["visited"].shape, start["ready"].shape[1], start.device
     env = BatchedMTSP(n_nodes, n_agents, [rows], SPEED, depot="final", device=device, check_actions=False)
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
         torch.manual_seed(seed)
-        last = rollout(actor, env, decode, nodes).last
+        last = rollout(actor, env, decode, start).last
     best = env.makespan(last).argmin()[None]
     return env.tours(last[best])[0]
 
 
 @torch.inference_mode()
-def _play_alone(network: DAN, instance: Instance) -> Tours:
+def _play_alone(network: DAN, state: rules.State, game: rules.Rules) -> Tours:
     """One greedy game, the same as ``_play``'s, with the rules on NumPy arrays: replanning takes half the time."""
-    game = rules.make_rules(instance.n_nodes, instance.n_agents, SPEED, "final", "sparse", None)
-    state = rules.start(instance.nodes[None], instance.n_agents)
     while not rules.all_visited(state)[0]:
         seen = rules.observe(state, game)
         logits = network(*(torch.from_numpy(part) for part in (seen.cities, seen.agents, seen.visited)))  # (1, n)

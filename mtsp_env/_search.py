@@ -5,12 +5,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from mtsp_env import _sisr
 from mtsp_env.instance import Tours
+from mtsp_env.tours import is_closed
 
 
 def new_search(nodes: np.ndarray, n_agents: int, seed: int) -> _sisr.Search:
@@ -92,8 +91,3 @@ def as_tours(order: np.ndarray, n_agents: int) -> Tours:
         if node == 0:
             tours.append([0])
     return tours[:-1] + [[0, 0] for _ in range(n_agents - len(tours) + 1)]
-
-
-def is_closed(prefix: Sequence[int]) -> bool:
-    """Whether an agent whose tour begins so is home for good."""
-    return len(prefix) > 1 and prefix[-1] == 0

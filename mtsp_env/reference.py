@@ -32,9 +32,9 @@ except ModuleNotFoundError as error:
         "mtsp_env.reference needs Numba: pip install 'mtsp-env[reference]'", name="numba"
     ) from error
 
-from mtsp_env._search import as_order, as_tours, is_closed, new_search, rest_as_order, set_off
+from mtsp_env._search import as_order, as_tours, new_search, rest_as_order, set_off
 from mtsp_env.instance import Instance, Tours, check_count, check_nodes
-from mtsp_env.tours import check_tours, farthest_trip, makespan, tour_lengths
+from mtsp_env.tours import check_prefixes, check_tours, farthest_trip, is_closed, makespan, tour_lengths
 
 ITERATIONS_PER_NODE = 500  # where neither seconds nor iterations are given
 HOT, COLD = 0.1, 0.0025  # first and last temperature, in units of makespan * sqrt(m / n), a few mean legs
@@ -68,9 +68,9 @@ def improve(
         iterations: at least 0; 2 to 4 microseconds each, longer with hundreds of agents. Without ``seconds`` the result
             depends on nothing but the arguments.
         seed: a whole number of at least 0.
-        prefixes: how each agent's tour begins, as ``rules.tours(..., close=False)`` tells it of a game: [0, 3, 5] went
-            to city 3 and is at or on the way to city 5, [0] has not left yet, [0, 3, 0] is home for good. The cost
-            stays the length of the whole tours.
+        prefixes: how each agent's tour begins (``mtsp_env.tours.check_prefixes``): [0, 3, 5] went to city 3 and is at
+            or on the way to city 5, [0] has not left yet, [0, 3, 0] is home for good. The cost stays the length of the
+            whole tours.
 
     Returns:
         One tour per agent, [0, ..., 0]; ``tours`` themselves, copied, where nothing better was found.
@@ -83,7 +83,7 @@ def improve(
         check_seconds("seconds", seconds)
     _check_search(iterations, seed)
     if prefixes is not None:
-        prefixes = _check_prefixes(instance.n_nodes, instance.n_agents, prefixes)
+        prefixes = check_prefixes(instance, prefixes)
     if tours is not None:
         check_tours(instance, tours)
         tours = [[int(node) for node in tour] for tour in tours]
@@ -129,7 +129,7 @@ def improve_batch(
     if prefixes is not None:
         if len(prefixes) != len(nodes):
             raise ValueError(f"expected prefixes for {len(nodes)} instances, got {len(prefixes)}")
-        begun = [_check_prefixes(nodes.shape[1], n_agents, one) for one in prefixes]
+        begun = [check_prefixes(Instance(row, n_agents), its) for row, its in zip(nodes, prefixes, strict=True)]
     compile_kernels()
     with ThreadPoolExecutor(threads) as pool:
         solve = functools.partial(_solve, n_agents=n_agents, iterations=iterations, seed=seed, tidy=tidy)
@@ -147,26 +147,6 @@ def _check_search(iterations: int | None, seed: int) -> None:
     if iterations is not None:
         check_count("iterations", iterations, minimum=0)
     check_count("seed", seed, minimum=0)
-
-
-def _check_prefixes(n_nodes: int, n_agents: int, prefixes: Sequence[Sequence[int]]) -> Tours:
-    """The prefixes as lists. Raises ValueError where no tours begin with them."""
-    prefixes = [[int(node) for node in prefix] for prefix in prefixes]
-    if len(prefixes) != n_agents:
-        raise ValueError(f"expected {n_agents} prefixes, one per agent, got {len(prefixes)}")
-    seen: set[int] = set()
-    for agent, prefix in enumerate(prefixes):
-        if not prefix or prefix[0] != 0:
-            raise ValueError(f"prefix {agent} must begin at the depot 0, got {prefix}")
-        for node in prefix:
-            if not 0 <= node < n_nodes:
-                raise ValueError(f"prefix {agent} visits node {node}, outside 0..{n_nodes - 1}")
-            if node and node in seen:
-                raise ValueError(f"city {node} is in the prefixes more than once")
-            seen.add(node)
-    if len(seen) < n_nodes and all(map(is_closed, prefixes)):
-        raise ValueError(f"all agents are home for good, and {n_nodes - len(seen)} cities are left")
-    return prefixes
 
 
 def _usable_cores() -> int:

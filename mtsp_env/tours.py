@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mtsp_env.instance import Instance
+from mtsp_env.instance import Instance, Tours
 
 
 def tour_lengths(nodes: np.ndarray, tours: Sequence[Sequence[int]]) -> np.ndarray:
@@ -45,6 +45,37 @@ def check_tours(instance: Instance, tours: Sequence[Sequence[int]]) -> None:
     repeated = np.flatnonzero(count[1:] > 1) + 1
     if len(repeated):
         raise ValueError(f"{_cities(repeated)} visited more than once")
+
+
+def check_prefixes(instance: Instance, prefixes: Sequence[Sequence[int]]) -> Tours:
+    """The beginnings of tours, as lists. Raises ValueError where no tours begin so.
+
+    One for each agent, as ``rules.tours(..., close=False)`` tells them of a game: [0, 3, 5] went to city 3 and is at or
+    on the way to city 5, [0] has not left yet, [0, 3, 0] is home for good.
+    """
+    prefixes = [[int(node) for node in prefix] for prefix in prefixes]
+    if len(prefixes) != instance.n_agents:
+        raise ValueError(f"expected {instance.n_agents} prefixes, one per agent, got {len(prefixes)}")
+    seen: set[int] = set()
+    for agent, prefix in enumerate(prefixes):
+        if not prefix or prefix[0] != 0:
+            raise ValueError(f"prefix {agent} must begin at the depot 0, got {prefix}")
+        for node in prefix:
+            if not 0 <= node < instance.n_nodes:
+                raise ValueError(f"prefix {agent} visits node {node}, outside 0..{instance.n_nodes - 1}")
+            if node and node in seen:
+                raise ValueError(f"city {node} is in the prefixes more than once")
+            seen.add(node)
+        if 0 in prefix[1:-1]:
+            raise ValueError(f"prefix {agent} must not pass the depot in between, got {prefix}")
+    if len(seen) < instance.n_nodes and all(map(is_closed, prefixes)):
+        raise ValueError(f"all agents are home for good, and {instance.n_nodes - len(seen)} cities are left")
+    return prefixes
+
+
+def is_closed(prefix: Sequence[int]) -> bool:
+    """Whether an agent whose tour begins so is home for good."""
+    return len(prefix) > 1 and prefix[-1] == 0
 
 
 def _cities(numbers: np.ndarray) -> str:

@@ -189,7 +189,7 @@ def test_the_policys_tours_are_what_is_improved(network, monkeypatch):
     instance, calls = uniform(np.random.default_rng(6), 12, 3), []
     monkeypatch.setattr(reference, "improve", lambda *args, **options: calls.append((args, options)) or args[1])
     plain, improved = (solve(instance, network, "sample", 4, seed=9, improve=seconds) for seconds in (None, 2.5))
-    assert calls == [((instance, plain.tours), {"seconds": 2.5, "seed": 9})]
+    assert calls == [((instance, plain.tours), {"seconds": 2.5, "seed": 9, "prefixes": None})]
     assert improved.tours == plain.tours
 
 

@@ -115,6 +115,7 @@ def test_games_are_finished_from_any_moment() -> None:
         ([[0], [3]], r"prefix 1 must begin at the depot 0, got \[3\]"),
         ([[0], [0, 7]], r"prefix 1 visits node 7, outside 0\.\.6"),
         ([[0, 2], [0, 2]], "city 2 is in the prefixes more than once"),
+        ([[0, 2, 0, 3], [0]], r"prefix 0 must not pass the depot in between, got \[0, 2, 0, 3\]"),
         ([[0, 2, 0], [0, 3, 0]], "all agents are home for good, and 4 cities are left"),
     ],
 )

@@ -20,6 +20,7 @@ from dan_policy.actor import OBSERVATION, make_actor
 from dan_policy.episode import rollout
 from mtsp_env import rules
 from mtsp_env.instance import Tours, sample_nodes
+from mtsp_env.tours import is_closed
 from train.collect import autocast, draw_size, environment
 from train.config import ImitateConfig
 from train.learner import make_network
@@ -97,10 +98,7 @@ def canonical(nodes: np.ndarray, tours: Tours, prefixes: Tours | None = None) ->
     ordered = [rests[agent] if _signed_area(nodes, rests[agent]) >= 0 else rests[agent][::-1] for agent in waiting]
     for agent, rest in zip(waiting, sorted(ordered, key=angle), strict=True):
         rests[agent] = rest
-    return [
-        prefix if len(prefix) > 1 and prefix[-1] == 0 else [*prefix, *rest, 0]
-        for prefix, rest in zip(prefixes, rests, strict=True)
-    ]
+    return [prefix if is_closed(prefix) else [*prefix, *rest, 0] for prefix, rest in zip(prefixes, rests, strict=True)]
 
 
 def _signed_area(nodes: np.ndarray, tour: list[int]) -> float:

@@ -1,0 +1,72 @@
+"""A team under way is replanned from where it is: the plan goes on as if it had never been interrupted."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from benchmarks.policies.nearest import nearest
+from dan_policy import make_actor, solve
+from dan_policy.solution import SPEED, _set_out
+from mtsp_env import Instance, check_tours, rules, uniform
+from mtsp_env.batched import BatchedMTSP
+from mtsp_env.instance import Tours
+
+
+def moments(instance: Instance, seed: int, depot: str = "final") -> list[tuple[rules.State, Tours]]:
+    """Every state of a random game but the last, and the tours so far."""
+    env = BatchedMTSP(instance.n_nodes, instance.n_agents, [1], SPEED, depot=depot)
+    torch.manual_seed(seed)
+    td = env.reset(env.reset().set("nodes", torch.tensor(instance.nodes)[None]).select("nodes"), set_state=True)
+    found = []
+    while not td["done"].item():
+        state = rules.State(*(td[name].numpy() for name in rules.State._fields))
+        found.append((state, rules.tours(state.visits[0], state.destination[0], close=False)))
+        td = env.step(env.rand_action(td))["next"]
+    return found
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(2, 12), st.integers(1, 5))
+@settings(max_examples=60, deadline=None)
+def test_prefixes_lead_to_the_very_moment_that_they_were_taken_at(seed: int, n_nodes: int, n_agents: int) -> None:
+    instance = uniform(np.random.default_rng(seed), n_nodes, n_agents)
+    game = rules.make_rules(n_nodes, n_agents, SPEED, "final", "sparse", None)
+    for state, prefixes in moments(instance, seed):
+        again = _set_out(instance, game, prefixes)
+        for name in rules.State._fields:
+            np.testing.assert_allclose(getattr(again, name), getattr(state, name), rtol=0, atol=1e-12, err_msg=name)
+
+
+@pytest.mark.parametrize("policy", ["default", make_actor(nearest)], ids=["DAN", "nearest"])
+def test_a_plan_goes_on_as_it_would_have(policy) -> None:
+    """Greedy play does not look back, so what is left of a plan is planned again, from any moment."""
+    instance = uniform(np.random.default_rng(5), 20, 3)
+    plan = solve(instance, policy)
+    played = np.concatenate([np.array(tour[1:-1]) for tour in plan.tours])
+    assert sorted(played) == list(range(1, 20))
+    state = _set_out(instance, rules.make_rules(20, 3, SPEED, "final", "sparse", None), [t[:-1] for t in plan.tours])
+    order = np.argsort(state.visits[0, 1:]) + 1  # the cities in the order of decisions
+    for done in range(20):
+        visited = set(order[:done].tolist())
+        prefixes = [[0, *(city for city in tour[1:-1] if city in visited)] for tour in plan.tours]
+        assert solve(instance, policy, prefixes=prefixes).tours == plan.tours
+
+
+@pytest.mark.parametrize("options", [{"augment": True}, {"decode": "sample", "samples": 5}, {"improve": 0.02}])
+def test_all_kinds_of_plans_keep_the_beginning(options: dict) -> None:
+    if "improve" in options:
+        pytest.importorskip("numba", reason="needs the extra reference")
+    instance = uniform(np.random.default_rng(6), 30, 4)
+    prefixes = [[0, 7, 3], [0], [0, 9, 0], [0, 1]]
+    solution = solve(instance, prefixes=prefixes, **options)
+    check_tours(instance, solution.tours)
+    assert all(tour[: len(prefix)] == prefix for tour, prefix in zip(solution.tours, prefixes, strict=True))
+    assert solution.tours[2] == [0, 9, 0]
+
+
+def test_nothing_left_to_plan() -> None:
+    instance = uniform(np.random.default_rng(7), 5, 2)
+    assert solve(instance, prefixes=[[0, 1, 2], [0, 3, 4, 0]]).tours == [[0, 1, 2, 0], [0, 3, 4, 0]]
+    with pytest.raises(ValueError, match="expected 2 prefixes, one per agent, got 1"):
+        solve(instance, prefixes=[[0]])
