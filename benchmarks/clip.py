@@ -1,4 +1,4 @@
-"""How surely samples should be drawn: the makespan of the best of them over C, which ``sample_clip`` was chosen by."""
+"""How surely samples should be drawn: the best of them at ``sample_clip``'s C, at half and at twice of it."""
 
 from __future__ import annotations
 
@@ -46,7 +46,8 @@ def main(
         "",
         f"Mean makespan over {instances} uniform instances of seed {SEED} (no test's), and the paired difference to "
         "the C of `dan_policy.solution.sample_clip` in %, ± standard error; weights "
-        f'"{policy}". Made by `python -m benchmarks clip`.',
+        f'"{policy}". Made by `python -m benchmarks clip --sizes {" ".join(sizes)} --instances {instances} '
+        f"--samples {samples}{' --augment' if augment else ''}`.",
         "",
         "| n, m | C | makespan | difference, % |",
         "|---|---|---|---|",

@@ -272,3 +272,9 @@ def test_the_command_line_imitates(tmp_path, capsys):
     assert "give --resume" in capsys.readouterr().err
     assert main(["imitate", "--steps", "3", "--resume", *small]) == 0
     assert checkpoint.read(tmp_path / "checkpoint.pt")["progress"]["step"] == 3
+
+
+def test_a_student_without_weights_is_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no weights at"):
+        imitate(replace(TINY, out=tmp_path / "run", roll_in=str(tmp_path / "nobody.safetensors")))
+    assert not (tmp_path / "run").exists()

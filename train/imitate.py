@@ -16,6 +16,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from dan_policy.actor import make_actor
+from dan_policy.weights import find
 from train.collect import autocast
 from train.config import ImitateConfig
 from train.demonstrations import Demonstrations, demonstrate, replay
@@ -180,6 +181,8 @@ def imitate(config: ImitateConfig) -> Imitator:
     import mtsp_env.reference  # noqa: F401 (say at once that Numba is missing)
 
     check_folder(config)
+    if config.roll_in is not None:
+        find(config.roll_in)  # say at once that there are no such weights
     imitator = Imitator(config)
     run(imitator)
     return imitator
