@@ -1,4 +1,4 @@
-"""``python -m benchmarks {run,report,best,aims,speed,clip,ablations,curves}``."""
+"""``python -m benchmarks {run,report,best,aims,speed,clip,view,ablations,curves}``."""
 
 from __future__ import annotations
 
@@ -198,11 +198,35 @@ def clip(
         augment: see the instances in the square's eight symmetries.
         out: file for the table; none: benchmarks/results/clip.md.
     """
-    from benchmarks import clip as module
+    from benchmarks import scan
 
     given = {"sizes": sizes} if sizes else {}
     given |= {"out": out} if out else {}
-    module.main(instances=instances, samples=samples, policy=policy, augment=augment, **given)
+    scan.clip(instances=instances, samples=samples, policy=policy, augment=augment, **given)
+
+
+@app.command
+def view(
+    sizes: tuple[str, ...] = (),
+    instances: int = 8,
+    samples: int | None = None,
+    policy: str = "default",
+    out: Path | None = None,
+) -> None:
+    """Makespans and times over how many cities agents see, on instances of no test: results/view.md.
+
+    Args:
+        sizes: such as 500x10; none: four from 200x10 to 1000x10.
+        instances: of each size, at least 2.
+        samples: of each plan; none: greedy plans.
+        policy: a shipped model or a file of weights.
+        out: file for the table; none: benchmarks/results/view.md.
+    """
+    from benchmarks import scan
+
+    given = {"sizes": sizes} if sizes else {}
+    given |= {"out": out} if out else {}
+    scan.view(instances=instances, samples=samples, policy=policy, **given)
 
 
 @app.command

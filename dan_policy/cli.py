@@ -22,7 +22,7 @@ from mtsp_env.tsplib import read_tsplib
 from mtsp_env.version import __version__
 
 METHODS = {  # each with the options that are its own
-    "dan": ("policy", "decode", "samples", "augment", "device", "precision", "improve"),
+    "dan": ("policy", "decode", "samples", "augment", "device", "precision", "view", "improve"),
     "reference": ("seconds",),
 }
 DEFAULT_SAMPLES = 64  # the paper's DAN(s.64)
@@ -105,6 +105,7 @@ def _dan(args: argparse.Namespace) -> Callable[[Instance], Plan]:
             device=args.device or "cpu",
             improve=args.improve,
             precision=args.precision or "auto",
+            view=args.view,
             augment=args.augment or False,
         )
         return Plan(solution.tours, solution.seconds, solution.method)
@@ -279,6 +280,12 @@ def _parser() -> argparse.ArgumentParser:
         "--precision",
         choices=("auto", "float32", "bfloat16"),
         help="--method dan: auto takes bfloat16 where that is faster (default: auto)",
+    )
+    option(
+        "--view",
+        type=_whole(1),
+        metavar="K",
+        help="--method dan: agents see the nearest K unvisited cities (default: all below 400 nodes, else 100)",
     )
     option("--improve", type=_seconds, metavar="SECONDS", help="--method dan: polish its tours for so many seconds")
     option("--plot", metavar="PATH", help="draw the tours: .png, .svg, .pdf, ...")

@@ -20,7 +20,8 @@ class DANConfig:
     """What a DAN looks like; presets ``DANConfig.paper()`` and ``DANConfig.official()``.
 
     Raises:
-        ValueError: a size below 1 (agent layers: 0), heads that do not divide the width, an unknown norm.
+        ValueError: a size below 1 (agent layers: 0), heads that do not divide the width, an unknown norm, a view of
+            visited cities.
     """
 
     embed_dim: int = 128  # d
@@ -33,6 +34,7 @@ class DANConfig:
     decoder_norm: Norm = "post"
     tanh_clip: float = 10.0  # C: logits lie in [-C, C]
     prune_visited: bool = False  # drop visited cities before the encoders: faster, not the paper
+    view: int | None = None  # with prune_visited: see no more than so many cities, the nearest unvisited ones
 
     def __post_init__(self) -> None:
         for name in ("embed_dim", "feedforward_dim", "n_heads", "city_layers", "agent_layers", "city_agent_layers"):
@@ -46,6 +48,8 @@ class DANConfig:
                 raise ValueError(f"unknown norm {norm!r}; choose from ['pre', 'post']")
         if not self.tanh_clip > 0:
             raise ValueError(f"tanh_clip must be above 0, got {self.tanh_clip!r}")
+        if self.view is not None and not (isinstance(self.view, int) and self.view >= 1 and self.prune_visited):
+            raise ValueError(f"view must be None, or with prune_visited at least 1 city, got {self.view!r}")
 
     @classmethod
     def paper(cls) -> DANConfig:
@@ -128,7 +132,7 @@ class DAN(nn.Module):
             visited: (..., n) bool, the global mask M, False at the depot.
 
         Returns:
-            (..., n) float, in [-C, C]; a visited node's logit means nothing: the actor masks it.
+            (..., n) float, in [-C, C]; -C out of view; a visited node's logit means nothing: the actor masks it.
         """
         lead, n = cities.shape[:-2], cities.shape[-2]
         cities, agents, visited = (
@@ -143,12 +147,17 @@ class DAN(nn.Module):
         return logits.reshape(*lead, n)
 
     def _pruned_logits(self, cities: Tensor, agents: Tensor, visited: Tensor) -> Tensor:
-        """Gather each row's unvisited nodes to the front, padded to the longest row; scatter their logits back."""
+        """Gather each row's nodes in view to the front, padded to the longest row; scatter their logits back."""
         is_open = ~visited
-        longest = int(is_open.sum(1).max())
-        if torch.is_autocast_enabled(cities.device.type):
-            longest = min(_round_up(longest), visited.shape[1])
-        kept = torch.argsort(visited.to(torch.uint8), dim=1, stable=True)[:, :longest]  # (B, k), the depot first
+        longest, view = int(is_open.sum(1).max()), self.config.view
+        if view is not None and longest > 1 + view:
+            distance = cities.square().sum(2).masked_fill(visited, torch.inf)
+            distance[:, 0] = -1.0  # the depot always is in view, and first
+            kept = distance.topk(1 + view, dim=1, largest=False).indices  # (B, k)
+        else:
+            if torch.is_autocast_enabled(cities.device.type):
+                longest = min(_round_up(longest), visited.shape[1])
+            kept = torch.argsort(visited.to(torch.uint8), dim=1, stable=True)[:, :longest]  # (B, k), the depot first
         real = is_open.gather(1, kept)  # (B, k) False at the padding
         logits = self._logits(
             cities.gather(1, kept[:, :, None].expand(-1, -1, 2)),
@@ -156,7 +165,7 @@ class DAN(nn.Module):
             real=None if bool(real.all()) else real,
             open_nodes=real,
         )
-        return logits.new_zeros(visited.shape).scatter(1, kept, logits)
+        return logits.new_full(visited.shape, -self.config.tanh_clip).scatter(1, kept, logits)
 
     def _logits(self, cities: Tensor, agents: Tensor, real: Tensor | None, open_nodes: Tensor) -> Tensor:
         """cities (B, k, 2), agents (B, m, 3) -> (B, k); ``real`` (B, k) is False at padding, None: there is none."""

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -28,6 +28,7 @@ from mtsp_env.tours import check_prefixes, check_tours, makespan
 Precision = Literal["auto", "float32", "bfloat16"]
 SPEED = 0.01  # the paper's Delta g in tests (Sec. 6)
 SHARP_CLIP = 100.0
+LARGE, LOCAL_VIEW = 400, 100  # from so many nodes on, so many cities are seen
 ENOUGH = 500  # nodes side by side from which bfloat16 pays on a CPU that multiplies such matrices
 
 
@@ -59,6 +60,7 @@ def solve(
     precision: Precision = "auto",
     augment: bool = False,
     clip: float | None = None,
+    view: int | None = None,
     prefixes: Sequence[Sequence[int]] | None = None,
 ) -> Solution:
     """Plan the team's tours with a policy (paper, Sec. 6: DAN(g.) and DAN(s.64)), and polish them where asked to.
@@ -81,6 +83,8 @@ def solve(
             hold enough nodes to gain (twice as fast for 64 samples on a CPU with AMX, equally good tours), for a DAN;
             "float32" elsewhere, and for tours that do not depend on the device.
         clip: C to sample with, above 0: the larger, the surer the likelier actions are drawn. None: ``sample_clip``.
+        view: how many cities a deciding agent sees at most, the nearest unvisited ones, at least 1: the fewer, the
+            sooner a plan is there. For a DAN with ``prune_visited``; None: ``default_view``.
         augment: the games see the instance in the square's eight symmetries in turn, and the best counts (Kwon et al.
             2020, POMO): "greedy" plays eight games instead of one, "sample" as many as without.
         prefixes: how each agent's tour begins (``mtsp_env.tours.check_prefixes``); None: all are at the depot. Each is
@@ -98,12 +102,20 @@ def solve(
         raise ValueError(f"unknown precision {precision!r}; choose from {list(get_args(Precision))}")
     if clip is not None and not clip > 0:
         raise ValueError(f"clip must be above 0, got {clip!r}")
+    if view is not None:
+        check_count("view", view, minimum=1)
     prefixes = None if prefixes is None else check_prefixes(instance, prefixes)
     polish = None if improve is None else _polish(improve, seed, prefixes)
     device = find_device(device)
     policy = _ready(policy, device)
-    if decode == "sample" and isinstance(policy, DAN):
-        policy = _sharpened(policy, clip or sample_clip(policy.config.tanh_clip, instance.n_nodes, augment))
+    if isinstance(policy, DAN):
+        own = policy.config
+        if decode == "sample":
+            policy = _with(policy, tanh_clip=clip or sample_clip(own.tanh_clip, instance.n_nodes, augment))
+        if view is not None or (own.prune_visited and own.view is None):
+            policy = _with(policy, view=view or default_view(instance.n_nodes))
+    elif view is not None:
+        raise ValueError(f"view must be None for a policy that is no DAN, got {view!r}")
 
     rows = samples if decode == "sample" else SYMMETRIES if augment else 1
     if precision == "auto":
@@ -206,11 +218,19 @@ def sample_clip(clip: float, n_nodes: int, augment: bool = False) -> float:
     return max(clip, min(SHARP_CLIP, clip * n_nodes / 50 * (3 if augment else 1)))
 
 
-def _sharpened(network: DAN, clip: float) -> DAN:
-    """The same weights with another C, which scales the logits."""
-    sharper = copy(network)  # shares the parameters
-    sharper.config = replace(network.config, tanh_clip=clip)
-    return sharper
+def default_view(n_nodes: int) -> int | None:
+    """How many cities an agent sees, of a policy trained on up to 100 nodes; None: all.
+
+    More cities than it was taught with do not help it: ``benchmarks.view``.
+    """
+    return LOCAL_VIEW if n_nodes >= LARGE else None
+
+
+def _with(network: DAN, **changes: Any) -> DAN:
+    """The same weights with another configuration: of what leaves their shapes alone."""
+    other = copy(network)  # shares the parameters
+    other.config = replace(network.config, **changes)
+    return other
 
 
 @lru_cache(maxsize=4)

@@ -75,6 +75,7 @@ def test_json_is_the_judges_verdict_in_the_units_of_the_file(folder, solver, cap
             "device": "cpu",
             "improve": None,
             "precision": "auto",
+            "view": None,
             "augment": False,
         }
     ]  # the defaults that --help names
@@ -82,7 +83,7 @@ def test_json_is_the_judges_verdict_in_the_units_of_the_file(folder, solver, cap
 
 def test_options_reach_the_solver(folder, solver) -> None:
     options = "--policy a.safetensors --decode sample --samples 7 --seed 5 --device cuda:1 --improve .5 --json"
-    options += " --precision float32 --augment"
+    options += " --precision float32 --augment --view 30"
     assert main(["solve", "square.json", *options.split()]) == 0
     assert solver.calls == [
         {
@@ -93,6 +94,7 @@ def test_options_reach_the_solver(folder, solver) -> None:
             "device": "cuda:1",
             "improve": 0.5,
             "precision": "float32",
+            "view": 30,
             "augment": True,
         }
     ]

@@ -14,6 +14,7 @@ CONFIGS = {
     "paper": DANConfig.paper(),
     "official": DANConfig.official(),
     "pruned": replace(SMALL, prune_visited=True),
+    "short-sighted": replace(SMALL, prune_visited=True, view=3),
 }
 
 
@@ -164,8 +165,39 @@ def test_official_has_the_published_size():
         ({"city_layers": 0}, "city_layers must be a whole number of at least 1, got 0"),
         ({"encoder_norm": "batch"}, "unknown norm 'batch'"),
         ({"tanh_clip": 0.0}, "tanh_clip must be above 0, got 0.0"),
+        (
+            {"view": 0, "prune_visited": True},
+            "view must be None, or with prune_visited at least 1 city, got 0",
+        ),
+        ({"view": 5}, "view must be None, or with prune_visited at least 1 city, got 5"),
     ],
 )
 def test_bad_configurations_are_named(kwargs, message):
     with pytest.raises(ValueError, match=message):
         DANConfig(**kwargs)
+
+
+def test_who_sees_a_few_cities_sees_the_nearest_unvisited_ones():
+    """As if the others were not there; those get the least logit, so that they stay legal."""
+    cities, agents, visited = observation(n=30)
+    torch.manual_seed(0)
+    network = DAN(replace(SMALL, prune_visited=True, view=6))
+    logits = network(cities, agents, visited)
+    for row in range(len(cities)):
+        distance = cities[row].square().sum(1).where(~visited[row], torch.inf)
+        distance[0] = -1.0
+        seen = distance.argsort()[:7].sort().values  # the depot and six cities
+        one = slice(row, row + 1)
+        alone = network(cities[one, seen], agents[one], visited[one, seen])
+        assert torch.allclose(logits[one, seen], alone, atol=1e-5)
+        hidden = [node for node in range(30) if node not in seen]
+        assert (logits[row, hidden] == -network.config.tanh_clip).all()
+
+
+def test_a_view_of_all_cities_hides_none():
+    cities, agents, visited = observation()
+    torch.manual_seed(0)
+    everything = DAN(CONFIGS["pruned"])
+    wide = DAN(replace(SMALL, prune_visited=True, view=8))
+    wide.load_state_dict(everything.state_dict())
+    assert torch.equal(wide(cities, agents, visited), everything(cities, agents, visited))

@@ -325,6 +325,36 @@ def test_a_sharper_clip_is_for_samples_alone(network, monkeypatch, decode, clip)
     assert network.config.tanh_clip == 10.0  # the given network stays as it is
 
 
+@pytest.mark.parametrize(("n_nodes", "told", "seen"), [(399, None, 398), (420, None, 100), (60, 7, 7), (60, 90, 59)])
+def test_large_instances_are_seen_in_part(monkeypatch, n_nodes, told, seen):
+    """From n = 400 on the nearest 100 cities, or as many as one is told; each decision's observation is cut alike."""
+    longest = []
+
+    def watched(self, cities, *args, **kwargs):
+        longest.append(cities.shape[1] - 1)
+        return logits(self, cities, *args, **kwargs)
+
+    logits = DAN._logits
+    monkeypatch.setattr(DAN, "_logits", watched)
+    torch.manual_seed(0)
+    network = DAN(DANConfig(embed_dim=16, feedforward_dim=16, n_heads=2, prune_visited=True))
+    instance = uniform(np.random.default_rng(0), n_nodes, 3)
+    solve(instance, network, device="cpu", precision="float32", view=told)
+    assert max(longest) == seen and network.config.view is None
+
+
+def test_a_view_is_for_a_dan_that_forgets_visited_cities(network):
+    instance = uniform(np.random.default_rng(0), 10, 3)
+    with pytest.raises(ValueError, match="view must be a whole number of at least 1, got 0"):
+        solve(instance, view=0)
+    with pytest.raises(ValueError, match="view must be None for a policy that is no DAN, got 5"):
+        solve(instance, make_actor(network), view=5)
+    with pytest.raises(ValueError, match="with prune_visited"):
+        solve(instance, DAN(DANConfig(embed_dim=16, feedforward_dim=16, n_heads=2)), view=5)
+    told = DAN(DANConfig(embed_dim=16, feedforward_dim=16, n_heads=2, prune_visited=True, view=4))
+    assert solve(instance, told, device="cpu").tours == solve(instance, told, device="cpu", view=4).tours
+
+
 @pytest.mark.parametrize(("n_nodes", "n_agents"), [(2, 1), (3, 5), (12, 3), (40, 6)])
 def test_a_game_alone_is_the_same_game(n_nodes, n_agents):
     """The quick way of a single greedy game and the general one of any actor."""

@@ -1,9 +1,11 @@
-"""Samples are drawn as surely as they are told to be."""
+"""Samples are drawn as surely as they are told to be, and agents see as far; the tables of both."""
 
 import numpy as np
 import pytest
 
+from benchmarks import scan
 from benchmarks.__main__ import main
+from benchmarks.suite import Cell
 from dan_policy import solve
 from dan_policy.solution import sample_clip
 from mtsp_env import uniform
@@ -30,8 +32,25 @@ def test_the_table_compares_with_the_c_in_use(tmp_path, capsys) -> None:
     assert main(["clip", "--sizes", "8x2", "60x4", "--instances", "2", "--samples", "3", "--out", str(out)]) == 0
     rows = [line.split(" | ") for line in out.read_text().splitlines() if line.startswith(("| 8", "| 60"))]
     assert [(row[0], row[1]) for row in rows] == [
-        ("| 8, 2", "5"), ("| 8, 2", "10"), ("| 8, 2", "20"), ("| 60, 4", "6"), ("| 60, 4", "12"), ("| 60, 4", "24")
+        ("| 8, 2", "10"), ("| 8, 2", "5"), ("| 8, 2", "20"), ("| 60, 4", "12"), ("| 60, 4", "6"), ("| 60, 4", "24")
     ]  # fmt: skip
-    assert [row[3] == "– |" for row in rows] == [False, True, False] * 2
+    assert [row[3] == "–" for row in rows] == [True, False, False] * 2
     assert main(["clip", "--instances", "1"]) == 2 and "at least 2, got 1" in capsys.readouterr().err
     assert main(["clip", "--sizes", "50"]) == 2 and "such as 50x5, got '50'" in capsys.readouterr().err
+
+
+def test_the_table_compares_with_seeing_everything(tmp_path) -> None:
+    """With more cities to see than there are, nothing but that; with fewer, other plans."""
+    out = tmp_path / "view.md"
+    assert main(["view", "--sizes", "40x3", "120x4", "--instances", "2", "--out", str(out)]) == 0
+    lines = out.read_text().splitlines()
+    rows = [line.strip("| ").split(" | ") for line in lines if line.startswith(("| 40", "| 12"))]
+    assert [(row[0], row[1]) for row in rows] == [
+        ("40, 3", "40"),
+        ("120, 4", "120"),
+        ("120, 4", "100"),
+        ("120, 4", "50"),
+    ]
+    assert [row[3] == "–" for row in rows] == [True, True, False, False]
+    plans = [solve(one, view=50) for one in Cell(120, 4, 2).instances(scan.SEED)]
+    assert float(rows[3][2]) == pytest.approx(np.mean([plan.makespan for plan in plans]), abs=1e-4)
