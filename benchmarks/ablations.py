@@ -166,13 +166,14 @@ def markdown(verdicts: list[dict[str, Any]]) -> str:
     heads = [f"{cell.heading}, {short}" for cell in CELLS for short in decodes.values()]
 
     def rows() -> Iterator[list[str]]:
-        yield ["gap to best known, %", *heads, "steps of imitation", "of REINFORCE", "weights"]
-        yield ["---"] * (len(heads) + 4)
+        yield ["gap to best known, %", *heads, "minutes", "steps of imitation", "of REINFORCE", "weights"]
+        yield ["---"] * (len(heads) + 5)
         for verdict in verdicts:
             each = [np.array(verdict["gaps"][cell.label][d]) * 100 for cell in CELLS for d in decodes]
             yield [
                 verdict["name"],
                 *(f"{gap.mean():.1f} ± {sem(gap):.1f}" for gap in each),
+                f"{verdict['seconds'] / 60:.1f}",
                 f"{verdict['imitation_steps']:,}",
                 f"{verdict['reinforce_steps']:,}",
                 f"{verdict['weights']:,}",
@@ -188,5 +189,6 @@ def _head(minutes: float, seed: int) -> str:
         f"n in {list(SIZES['n_nodes'])}, m in {list(SIZES['n_agents'])}, seed {seed}: 70 % of the time imitation, 30 % "
         f"REINFORCE, where nothing else is said. Mean gap to the best known tours of Table 1's 20 instances in each "
         f"column (n, m), ± standard error; one training run of each, so small differences may be chance. "
+        f"The steps of imitation are set by a trial's pace, and minutes are what came of that. "
         f"Made by `python -m benchmarks ablations --minutes {minutes:g}`."
     )

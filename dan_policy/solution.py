@@ -119,7 +119,7 @@ def solve(
 
     rows = samples if decode == "sample" else SYMMETRIES if augment else 1
     if precision == "auto":
-        gains = isinstance(policy, DAN) and _multiplies_bfloat16(device) and rows * instance.n_nodes >= ENOUGH
+        gains = isinstance(policy, DAN) and _multiplies_bfloat16(device) and rows * _seen(policy, instance) >= ENOUGH
         precision = "bfloat16" if gains else "float32"
 
     start = time.perf_counter()
@@ -216,6 +216,11 @@ def sample_clip(clip: float, n_nodes: int, augment: bool = False) -> float:
     games differ without chance, too: they are three times as sure.
     """
     return max(clip, min(SHARP_CLIP, clip * n_nodes / 50 * (3 if augment else 1)))
+
+
+def _seen(network: DAN, instance: Instance) -> int:
+    """Nodes in view at most."""
+    return min(instance.n_nodes, 1 + (network.config.view or instance.n_nodes))
 
 
 def default_view(n_nodes: int) -> int | None:

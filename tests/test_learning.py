@@ -74,7 +74,7 @@ def test_verdicts_are_kept_and_not_mixed(tmp_path, monkeypatch, capsys):
     ablations.main(2.0, tmp_path, 0, tmp_path / "out" / "table.md")
     table = (tmp_path / "out" / "table.md").read_text()
     both = "| 20.0 ± 10.0 | 2.0 ± 1.0 "
-    assert f"| imitation alone {3 * both}| 1,234 | 7 | 1,000 |" in table.splitlines()
+    assert f"| imitation alone {3 * both}| 2.0 | 1,234 | 7 | 1,000 |" in table.splitlines()
     assert "python -m benchmarks ablations --minutes 2`" in table
     with pytest.raises(ValueError, match="is of another run"):
         ablations.main(3.0, tmp_path, 0, tmp_path / "table.md")

@@ -217,6 +217,7 @@ def test_what_cannot_be_improved_is_not_planned(network, monkeypatch, kwargs, me
     [
         ({"decode": "sample", "samples": 64}, 8, True),  # 512 nodes side by side
         ({"decode": "sample", "samples": 62}, 8, False),
+        ({"decode": "sample", "samples": 64, "view": 3}, 8, False),
         ({"decode": "greedy"}, 8, False),
         ({"decode": "greedy", "precision": "bfloat16"}, 8, True),
         ({"decode": "sample", "samples": 64, "precision": "float32"}, 8, False),
