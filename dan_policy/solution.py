@@ -84,7 +84,7 @@ def solve(
             "float32" elsewhere, and for tours that do not depend on the device.
         clip: C to sample with, above 0: the larger, the surer the likelier actions are drawn. None: ``sample_clip``.
         view: how many cities a deciding agent sees at most, the nearest unvisited ones, at least 1: the fewer, the
-            sooner a plan is there. For a DAN with ``prune_visited``; None: ``default_view``.
+            sooner a plan is there. For a DAN with ``prune_visited``. None: its configuration's, else ``default_view``.
         augment: the games see the instance in the square's eight symmetries in turn, and the best counts (Kwon et al.
             2020, POMO): "greedy" plays eight games instead of one, "sample" as many as without.
         prefixes: how each agent's tour begins (``mtsp_env.tours.check_prefixes``); None: all are at the depot. Each is

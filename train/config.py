@@ -149,7 +149,8 @@ class ReinforceConfig(RunConfig):
     """One-sided paired t-test: the policy replaces the baseline below this p."""
 
     decisions: float = 1.0
-    """Share of a batch's decisions that its gradient is estimated from, drawn at random."""
+    """Share of a batch's decisions that its gradient is estimated from, drawn at random. Fewer make a step shorter, and
+    its gradient noisier: the variance is up to one over the share of what all of them would give."""
     chunk: int = 512
     """Decisions whose log-probabilities are recomputed at once: the bound on memory."""
 
