@@ -84,7 +84,8 @@ def solve(
             "float32" elsewhere, and for tours that do not depend on the device.
         clip: C to sample with, above 0: the larger, the surer the likelier actions are drawn. None: ``sample_clip``.
         view: how many cities a deciding agent sees at most, the nearest unvisited ones, at least 1: the fewer, the
-            sooner a plan is there. For a DAN with ``prune_visited``. None: its configuration's, else ``default_view``.
+            sooner a plan is there. For a DAN with ``prune_visited``. None: its configuration's, else ``default_view``,
+            which is for policies taught on small instances: one taught on larger ones wants ``view=n_nodes``.
         augment: the games see the instance in the square's eight symmetries in turn, and the best counts (Kwon et al.
             2020, POMO): "greedy" plays eight games instead of one, "sample" as many as without.
         prefixes: how each agent's tour begins (``mtsp_env.tours.check_prefixes``); None: all are at the depot. Each is
@@ -224,9 +225,9 @@ def _seen(network: DAN, instance: Instance) -> int:
 
 
 def default_view(n_nodes: int) -> int | None:
-    """How many cities an agent sees, of a policy trained on up to 100 nodes; None: all.
+    """How many cities an agent sees, of a policy taught on up to 100 nodes; None: all.
 
-    More cities than it was taught with do not help it: ``benchmarks.view``.
+    From ``LARGE`` nodes on, more cities than it was taught with do not help it (``python -m benchmarks view``).
     """
     return LOCAL_VIEW if n_nodes >= LARGE else None
 
