@@ -23,9 +23,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-# Chosen on uniform instances of 50 to 1000 nodes; half or twice of any of them changes little.
+# Chosen on uniform instances of 50 to 1000 nodes; half or twice of any of them changes little, but for N_NEAR.
 TOTAL_WEIGHT = 0.01  # of the total length against the makespan
-N_NEAR = 20  # a city's nearest cities, next to which it may go
+N_NEAR = 40  # a city's nearest cities, next to which it may go: half of them are off their tours when it is its turn
 MEAN_REMOVED = 10.0  # cities per iteration, about (the paper's c-bar)
 MAX_STRING = 10.0  # cities of one string (the paper's L-max)
 SPLIT_CHANCE = 0.5  # that a string leaves some cities in its middle (the paper's alpha)
@@ -42,7 +42,7 @@ class Search(NamedTuple):
 
     x: np.ndarray  # (N,) float64
     y: np.ndarray  # (N,) float64
-    near: np.ndarray  # (n, K) int32, a city's nearest cities, nearest first
+    near: np.ndarray  # (n, K) int64, a city's nearest cities, nearest first
     near_distance: np.ndarray  # (n, K) float64
     previous: np.ndarray  # (N,) int32
     next: np.ndarray  # (N,) int32
@@ -65,7 +65,7 @@ class Search(NamedTuple):
 @njit(cache=True, nogil=True)
 def nearest_cities(x: np.ndarray, y: np.ndarray, n: int, n_near: int) -> tuple[np.ndarray, np.ndarray]:
     """``near`` and ``near_distance`` of a Search, for nodes at ``x`` and ``y`` (at least n,). O(n^2) time."""
-    near, distance = np.zeros((n, n_near), np.int32), np.zeros((n, n_near))
+    near, distance = np.zeros((n, n_near), np.int64), np.zeros((n, n_near))
     for city in range(1, n if n_near else 0):
         found = 0
         for other in range(1, n):
@@ -179,18 +179,17 @@ def anneal(
             total = search.length.sum()
         n_removed, shrinkage = _ruin(search, iteration, makespan)
         _sort(search, n_removed)
-        growth = _recreate(search, n_removed, makespan)
-        new_makespan = search.length.max()
-        worse = new_makespan - makespan + TOTAL_WEIGHT * (growth - shrinkage)
-        if worse < -temperature * log(1.0 - _random(search)):
-            makespan = new_makespan
+        limit = makespan + TOTAL_WEIGHT * shrinkage - temperature * log(1.0 - _random(search))
+        n_back, growth, longest = _recreate(search, n_removed, makespan, limit)
+        if longest + TOTAL_WEIGHT * growth < limit:
+            makespan = longest
             total += growth - shrinkage
             score = makespan + weight * total
             if score < best - FINE:
                 best = score
                 search.best[:] = search.next
         else:
-            _undo(search, n_removed)
+            _undo(search, n_removed, n_back)
         temperature *= cooling
     return best
 
@@ -272,67 +271,80 @@ def _sort(search, n_removed):
     depot = search.tour.shape[0] - 1
     rule = _random(search) * 7.0
     for i in range(n_removed):
-        city, j = search.city_log[0, i], i
-        key = _random(search)
-        if rule >= 4.0:
-            key = _distance(search, depot, city) * (-1.0 if rule < 6.0 else 1.0)
-        while j > 0 and search.key[j - 1] > key:
-            search.key[j], search.city_log[1, j] = search.key[j - 1], search.city_log[1, j - 1]
-            j -= 1
-        search.key[j], search.city_log[1, j] = key, city
+        city = search.city_log[0, i]
+        if rule < 4.0:
+            j = int(_random(search) * (i + 1.0))
+            search.city_log[1, i] = search.city_log[1, j]
+        else:
+            key, j = _distance(search, depot, city) * (-1.0 if rule < 6.0 else 1.0), i
+            while j > 0 and search.key[j - 1] > key:
+                search.key[j], search.city_log[1, j] = search.key[j - 1], search.city_log[1, j - 1]
+                j -= 1
+            search.key[j] = key
+        search.city_log[1, j] = city
 
 
 @njit(cache=True, inline="always")
-def _recreate(search, n_removed, makespan):
-    """Put the removed cities back, each at its cheapest place; how much the total length grows."""
+def _recreate(search, n_removed, makespan, limit):
+    """Put the removed cities back, each at its cheapest place, until the makespan plus the weighted growth of the total
+    length is at least ``limit``: it never falls again. How many are back, that growth, and that makespan."""
     balance = _random(search) < BALANCE_CHANCE
-    total = 0.0
-    for i in range(n_removed):
-        city = search.city_log[1, i]
-        place, growth = _cheapest_place(search, city, makespan, balance)
+    n_back, growth, longest = 0, 0.0, search.length.max()
+    while n_back < n_removed and longest + TOTAL_WEIGHT * growth < limit:
+        city = search.city_log[1, n_back]
+        place, detour = _cheapest_place(search, city, makespan, balance)
         agent = search.tour[place]
-        search.tour_log[1, i] = agent
-        search.length_log[1, i] = search.length[agent]
-        search.length[agent] += growth
-        total += growth
+        search.tour_log[1, n_back] = agent
+        search.length_log[1, n_back] = search.length[agent]
+        search.length[agent] += detour
+        longest = max(longest, search.length[agent])
+        growth += detour
         _link(search, city, place)
-    return total
+        n_back += 1
+    return n_back, growth, longest
 
 
 @njit(cache=True, inline="always")
 def _cheapest_place(search, city, makespan, balance):
     """The node after which ``city`` goes, and by how much its tour grows."""
-    n_agents, n_near = search.length.shape[0], search.near.shape[1]
-    depot = search.tour.shape[0] - n_agents
-    home = _distance(search, depot, city)
+    depot = search.tour.shape[0] - search.length.shape[0]
     blink = int(_random(search) * BLINK)
-    least, place, place_growth = inf, depot, 0.0
-    for k in range(n_near + n_agents):
-        node = search.near[city, k] if k < n_near else depot + k - n_near
-        to_node = search.near_distance[city, k] if k < n_near else home
-        agent = search.tour[node]
-        if agent < 0 or (k == blink and k < n_near):  # not the depots, so that there always is a place
-            continue
-        length = search.length[agent]
-        offset = length if balance else 0.0
-        for side in range(2):  # before the node, after it
-            end = node if side == 0 else search.next[node]
-            # A cheap bound: the leg's other end is farther away than this node, or the leg has had its turn from there
-            if 2.0 * to_node - search.leg[end] + offset >= least:
-                continue
-            other = search.previous[node] if side == 0 else end
-            growth = to_node + _distance(search, other, city) - search.leg[end]
-            cost = offset + growth
-            if not balance and length + growth > makespan:
-                cost += (length + growth - makespan) / TOTAL_WEIGHT
-            if cost < least:
-                least, place, place_growth = cost, search.previous[end], growth
-    return place, place_growth
+    found = (inf, depot, 0.0)
+    for k in range(search.near.shape[1]):
+        node = search.near[city, k]
+        if search.tour[node] >= 0 and k != blink:
+            found = _cheaper(search, city, node, search.near_distance[city, k], makespan, balance, found)
+    home = _distance(search, depot, city)
+    for node in range(depot, search.tour.shape[0]):  # without blinks, so that there always is a place
+        found = _cheaper(search, city, node, home, makespan, balance, found)
+    _, place, growth = found
+    return place, growth
 
 
 @njit(cache=True, inline="always")
-def _undo(search, n_removed):
-    for i in range(n_removed - 1, -1, -1):
+def _cheaper(search, city, node, to_node, makespan, balance, found):
+    """``found`` (cost, place, growth of the tour), or the place before or after ``node`` where one is cheaper."""
+    least, place, place_growth = found
+    length = search.length[search.tour[node]]
+    offset = length if balance else 0.0
+    for side in range(2):  # before the node, after it
+        end = node if side == 0 else search.next[node]
+        # A cheap bound: the leg's other end is farther away than this node, or the leg has had its turn from there
+        if 2.0 * to_node - search.leg[end] + offset >= least:
+            continue
+        other = search.previous[node] if side == 0 else end
+        growth = to_node + _distance(search, other, city) - search.leg[end]
+        cost = offset + growth
+        if not balance and length + growth > makespan:
+            cost += (length + growth - makespan) / TOTAL_WEIGHT
+        if cost < least:
+            least, place, place_growth = cost, search.previous[end], growth
+    return least, place, place_growth
+
+
+@njit(cache=True, inline="always")
+def _undo(search, n_removed, n_back):
+    for i in range(n_back - 1, -1, -1):
         _unlink(search, search.city_log[1, i])
         search.length[search.tour_log[1, i]] = search.length_log[1, i]
     for i in range(n_removed - 1, -1, -1):
