@@ -126,6 +126,8 @@ def aims(
     instances: int = 50,
     cells: tuple[str, ...] = (),
     best_seconds: float | None = None,
+    sample: int = 0,
+    sample_seconds: float = 600.0,
     workers: int = 1,
     seed: int = SEED,
     out: Path | None = None,
@@ -136,6 +138,9 @@ def aims(
         instances: in each cell, at least 2.
         cells: labels of aims, such as 50x5; none: all.
         best_seconds: of a long run on each instance first, where it had none as long; none: no long runs.
+        sample: so many instances of each cell that are not proved optimal are run for far longer (0 or at least 2), to
+            tell what that takes off the best known tours; runs that were done before are not done again.
+        sample_seconds: of these far longer runs.
         workers: long runs side by side.
         seed: of the instances.
         out: file for the table; none: benchmarks/results/aims.md.
@@ -144,7 +149,8 @@ def aims(
 
     given = {"cells": cells} if cells else {}
     given |= {"out": out} if out else {}
-    module.main(instances, best_seconds=best_seconds, workers=workers, seed=seed, **given)
+    given |= {"best_seconds": best_seconds, "sample": sample, "sample_seconds": sample_seconds}
+    module.main(instances, workers=workers, seed=seed, **given)
 
 
 @app.command

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -63,17 +64,31 @@ class Measured:
     cpu: np.ndarray  # seconds
     searched: np.ndarray  # seconds of the long run that the best known tours are at least as good as
     proved: np.ndarray  # bool, the best known tours are at the lower bound
+    shorter: dict[
+        int, float
+    ]  # by the number of a sampled instance: what a far longer run took off the best known tours
 
     @property
     def met(self) -> bool:
         """The mean gap is what was aimed at, or less."""
         return bool(self.gap.mean() <= self.aim.gap)
 
+    @property
+    def gap_of_sample(self) -> tuple[float, float]:
+        """Mean gap, and its standard error, if all that is not proved gave way as the sampled instances did."""
+        shorter = np.array(list(self.shorter.values()))
+        left = ~self.proved
+        left[list(self.shorter)] = False  # their best known tours are those of the far longer run already
+        share = left.mean()
+        return self.gap.mean() + share * shorter.mean(), math.hypot(sem(self.gap), share * sem(shorter))
+
 
 def main(
     instances: int = 50,
     cells: tuple[str, ...] = tuple(aim.label for aim in AIMS),
     best_seconds: float | None = None,
+    sample: int = 0,
+    sample_seconds: float = 600.0,
     workers: int = 1,
     seed: int = SEED,
     out: Path = REPORT,
@@ -86,6 +101,10 @@ def main(
         cells: labels of aims, such as "50x5".
         best_seconds: of a long run on each instance before anything is measured; those that had as long a run already
             (``out`` with the suffix ".json" remembers) are not run again. None: no long runs.
+        sample: so many instances of each cell, drawn from those that are not proved optimal, are run for
+            ``sample_seconds`` (``out`` with "-sample.json" remembers), for what that takes off their best known tours.
+            0: none. At least 2, for a standard error.
+        sample_seconds: of these far longer runs.
         workers: long runs side by side. Measurements have the machine to themselves.
         seed: of the instances.
         out: file for the table in Markdown.
@@ -101,13 +120,22 @@ def main(
         raise ValueError(f"unknown cell {unknown[0]!r}; choose from {list(known)}")
     if best_seconds is not None:
         check_seconds("best_seconds", best_seconds)
+    check_count("sample", sample, minimum=0)
+    if sample == 1:
+        raise ValueError("sample must be 0 or at least 2, got 1")
+    check_seconds("sample_seconds", sample_seconds)
     compile_kernels()
     aims, spent = [known[label] for label in cells], out.with_suffix(".json")
     if best_seconds is not None:
         for aim in aims:
             search(aim.cell(instances), seed, best_seconds, workers, spent, folder)
-    found = [measure(aim, aim.cell(instances), seed, spent, folder) for aim in aims]
+    sampled = out.with_name(f"{out.stem}-sample.json")
+    for aim in aims if sample else []:
+        search_sample(aim.cell(instances), seed, sample_seconds, sample, workers, sampled, folder)
+    found = [measure(aim, aim.cell(instances), seed, out, folder, sample_seconds) for aim in aims]
     table = markdown(found)
+    if any(one.shorter for one in found):
+        table += f"\n\n{sample_markdown(found, sample_seconds)}"
     print(table)
     head = (
         f"{instances} uniform instances of each size, seed {seed}; one thread on {_machine()}. "
@@ -132,8 +160,28 @@ def search(cell: Cell, seed: int, seconds: float, workers: int, spent: Path, fol
             replace_text(spent, json.dumps({**_read(spent), f"{cell.label}-seed{seed}": done}))
 
 
-def measure(aim: Aim, cell: Cell, seed: int, spent: Path, folder: Path) -> Measured:
-    """``improve`` for the aim's seconds on each instance of the cell."""
+def search_sample(cell: Cell, seed: int, seconds: float, count: int, workers: int, sampled: Path, folder: Path) -> None:
+    """Far longer runs on ``count`` instances that are not proved; ``sampled`` has by how much their best known tours
+    became shorter, and the runs that it has are not run again."""
+    instances, kept = cell.instances(seed), best.read(cell, seed, folder)
+    key, done = _sample_key(cell, seed, seconds), _read(sampled).get(_sample_key(cell, seed, seconds), {})
+    cost = {i: makespan(instances[i].nodes, tours) for i, tours in kept.items()}
+    order = [int(i) for i in np.random.default_rng(seed).permutation(cell.count)]
+    unproved = [i for i in order if i in cost and cost[i] > lower_bound(instances[i]) + best.CLOSED]
+    jobs = [i for i in unproved if str(i) not in done][: max(count - len(done), 0)]
+
+    def run(i: int) -> tuple[int, Tours]:
+        return i, improve(instances[i], seconds=seconds, seed=seed + i)
+
+    with ThreadPoolExecutor(workers) as pool:
+        for i, tours in track(pool.map(run, jobs), total=len(jobs), description=f"{cell.label}: {seconds:g} s"):
+            best.merge(cell, seed, {i: tours}, folder)
+            done[str(i)] = max(0.0, 1.0 - makespan(instances[i].nodes, tours) / cost[i])
+            replace_text(sampled, json.dumps({**_read(sampled), key: done}))
+
+
+def measure(aim: Aim, cell: Cell, seed: int, out: Path, folder: Path, sample_seconds: float = 600.0) -> Measured:
+    """``improve`` for the aim's seconds on each instance of the cell; what was run before stands beside ``out``."""
     instances, found, wall, cpu = cell.instances(seed), {}, [], []
     for i, instance in enumerate(track(instances, description=f"{cell.label}: {aim.seconds:g} s")):
         started, started_cpu = time.perf_counter(), time.process_time()
@@ -144,9 +192,11 @@ def measure(aim: Aim, cell: Cell, seed: int, spent: Path, folder: Path) -> Measu
     kept = best.read(cell, seed, folder)
     cost, least = (np.array([makespan(x.nodes, tours[i]) for i, x in enumerate(instances)]) for tours in (found, kept))
     bound = np.array([lower_bound(instance) for instance in instances])
-    searched = np.array(_spent(spent, cell, seed)[: cell.count])
+    searched = np.array(_spent(out.with_suffix(".json"), cell, seed)[: cell.count])
+    sampled = _read(out.with_name(f"{out.stem}-sample.json")).get(_sample_key(cell, seed, sample_seconds), {})
+    shorter = {int(i): gain for i, gain in sampled.items() if int(i) < cell.count}
     gap = np.maximum(cost / least - 1.0, 0.0)  # ties in the last bit are no gap below 0
-    return Measured(aim, gap, np.array(wall), np.array(cpu), searched, least <= bound + best.CLOSED)
+    return Measured(aim, gap, np.array(wall), np.array(cpu), searched, least <= bound + best.CLOSED, shorter)
 
 
 NOTE = (
@@ -178,6 +228,30 @@ def markdown(found: list[Measured]) -> str:
     return "\n".join(lines)
 
 
+def sample_markdown(found: list[Measured], seconds: float) -> str:
+    """What far longer runs of some instances say of the best known tours, a row for each aim that has them."""
+    lines = [
+        f"Runs of {seconds:g} s, on instances drawn from those that are not proved, and the mean gap if the best known "
+        "tours of the others gave way as much:",
+        "",
+        "| n, m | instances | best known tours became shorter by, % | gap then, % | met |",
+        "|---|---|---|---|---|",
+    ]
+    for one in found:
+        if one.shorter:
+            shorter, (gap, error) = np.array(list(one.shorter.values())), one.gap_of_sample
+            lines.append(
+                f"| {one.aim.n_nodes}, {one.aim.n_agents} | {len(shorter)} "
+                f"| {100 * shorter.mean():.3f} ± {100 * sem(shorter):.3f} | {100 * gap:.2f} ± {100 * error:.2f} "
+                f"| {'yes' if gap <= one.aim.gap else 'no'} |"
+            )
+    return "\n".join(lines)
+
+
+def _sample_key(cell: Cell, seed: int, seconds: float) -> str:
+    return f"{cell.label}-seed{seed}-{seconds:g}s"
+
+
 def _milliseconds(seconds: float) -> str:
     return f"{1e3 * seconds:,.1f}".removesuffix(".0")
 
@@ -194,5 +268,5 @@ def _spent(path: Path, cell: Cell, seed: int) -> list[float]:
     return done + [0.0] * (cell.count - len(done))
 
 
-def _read(path: Path) -> dict[str, list[float]]:
+def _read(path: Path) -> dict:
     return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}

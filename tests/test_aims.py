@@ -1,5 +1,6 @@
 """The table of the reference solver's aims: gaps by hand, long runs that are never done twice."""
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -7,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mtsp_env import Instance, makespan
+from mtsp_env import Instance, lower_bound, makespan
 from mtsp_env.instance import Tours
 
 pytest.importorskip("numba", reason="needs the extra reference")
 from benchmarks import aims, best
 from benchmarks.aims import Aim, Measured
+from mtsp_env.reference import improve
 
 TINY = (Aim(8, 2, 0.001, 0.5), Aim(6, 3, 0.002, 0.1))
 BAD = [[0, *range(1, 8), 0], [0, 0]]  # all cities to one agent, as they are numbered
@@ -63,7 +65,7 @@ def test_gaps_are_to_the_best_known_tours(monkeypatch, places) -> None:
     known = [[0, *range(1, 5), 0], [0, *range(5, 8), 0]]
     best.merge(cell, 7, {0: known, 1: known}, places["folder"])
     monkeypatch.setattr(aims, "improve", Fake())
-    found = aims.measure(TINY[0], cell, 7, places["out"].with_suffix(".json"), places["folder"])
+    found = aims.measure(TINY[0], cell, 7, places["out"], places["folder"])
     gaps = [makespan(x.nodes, BAD) / makespan(x.nodes, known) - 1.0 for x in instances[:2]]
     assert found.gap == pytest.approx([*gaps, 0.0])
     assert best.read(cell, 7, places["folder"]) == {0: known, 1: known, 2: BAD}  # what is measured is kept, too
@@ -75,7 +77,7 @@ def test_gaps_are_to_the_best_known_tours(monkeypatch, places) -> None:
 @pytest.mark.parametrize(("gap", "met"), [(0.009, True), (0.010, True), (0.011, False)])
 def test_a_larger_mean_gap_is_not_met(gap: float, met: bool) -> None:
     three = np.ones(3)
-    found = Measured(Aim(50, 5, 0.005, 0.01), gap * np.array([0.5, 1.0, 1.5]), three, 0.5 * three, three, three > 0)
+    found = Measured(Aim(50, 5, 0.005, 0.01), gap * np.array([0.5, 1.0, 1.5]), three, 0.5 * three, three, three > 0, {})
     assert found.met == met
     row = aims.markdown([found]).splitlines()[-1]
     error = 100 * gap * 0.5 / 3**0.5
@@ -113,11 +115,63 @@ def test_nothing_makes_the_best_known_tours_worse(monkeypatch, places) -> None:
     assert table(places["out"])[0][3] == "no"
 
 
+def test_samples_tell_what_far_longer_runs_take_off_the_best_known_tours(monkeypatch, places) -> None:
+    cell, folder, sampled = TINY[1].cell(20), places["folder"], places["out"].with_name("aims-sample.json")
+    instances = cell.instances(7)
+    optimal = [improve(instance, iterations=1000) for instance in instances]
+    proved = [makespan(x.nodes, tours) <= lower_bound(x) + 1e-9 for x, tours in zip(instances, optimal, strict=True)]
+    assert 0 < sum(proved) < 17  # at least four are not
+    known, better = [[0, *range(1, 6), 0], [0, 0], [0, 0]], [[0, 1, 2, 0], [0, 3, 4, 0], [0, 5, 0]]
+    best.merge(cell, 7, {i: optimal[i] if proved[i] else known for i in range(20)}, folder)
+    calls = []
+
+    def found(instance: Instance, seconds: float, seed: int) -> Tours:
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        calls.append((int(instance.name.rpartition("-")[2]), seconds, seed))
+        return better if len(calls) < 3 else known
+
+    def run(count: int) -> dict[str, float]:
+        aims.search_sample(cell, 7, 600.0, count, 1, sampled, folder)
+        return json.loads(sampled.read_text())["6x3-seed7-600s"]
+
+    monkeypatch.setattr(aims, "improve", found)
+    two = run(2)
+    for i in map(int, two):
+        gain = 1.0 - makespan(instances[i].nodes, better) / makespan(instances[i].nodes, known)
+        assert gain > 0.1 and two[str(i)] == pytest.approx(gain)
+        assert best.read(cell, 7, folder)[i] == better
+    assert run(2) == two and len(calls) == 2  # none is run twice
+    with pytest.raises(KeyboardInterrupt):
+        run(20)
+    three = json.loads(sampled.read_text())["6x3-seed7-600s"]
+    assert two.items() <= three.items() and three[str(calls[2][0])] == 0.0  # nothing found is nothing gained
+    assert calls == [(i, 600.0, 7 + i) for i, *_ in calls] and len({i for i, *_ in calls}) == 3
+    assert not any(proved[i] for i, *_ in calls)
+    monkeypatch.setattr(aims, "improve", Fake())
+    assert aims.measure(TINY[1], cell, 7, places["out"], folder).shorter == {int(i): g for i, g in three.items()}
+    assert aims.measure(TINY[1], cell, 7, places["out"], folder, 60.0).shorter == {}
+
+
+def test_what_samples_show_is_added_for_the_instances_that_are_neither_proved_nor_sampled() -> None:
+    one, proved = np.ones(5), np.array([True, False, False, False, False])
+    gap = np.array([0.0, 0.004, 0.01, 0.006, 0.0])
+    found = Measured(Aim(50, 5, 0.005, 0.01), gap, one, one, one, proved, {1: 0.01, 2: 0.03})
+    gap, error = found.gap_of_sample
+    assert gap == pytest.approx(0.004 + 2 / 5 * 0.02)
+    assert error == pytest.approx(np.hypot(0.0019, 2 / 5 * 0.01), abs=1e-5)
+    row = aims.sample_markdown([found, dataclasses.replace(found, shorter={})], 600.0).splitlines()[4:]
+    assert row == [f"| 50, 5 | 2 | 2.000 ± 1.000 | 1.20 ± {100 * error:.2f} | no |"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"instances": 1}, "instances must be a whole number of at least 2, got 1"),
         ({"workers": 0}, "workers must be a whole number of at least 1, got 0"),
+        ({"sample": 1}, "sample must be 0 or at least 2, got 1"),
+        ({"sample": -2}, "sample must be a whole number of at least 0, got -2"),
+        ({"sample": 2, "sample_seconds": 0.0}, "sample_seconds must be a finite number above 0, got 0.0"),
         ({"best_seconds": 0.0}, "best_seconds must be a finite number above 0, got 0.0"),
         ({"cells": ("8x2", "9x9")}, r"unknown cell '9x9'; choose from \['8x2', '6x3'\]"),
     ],
