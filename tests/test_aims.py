@@ -160,7 +160,9 @@ def test_what_samples_show_is_added_for_the_instances_that_are_neither_proved_no
     gap, error = found.gap_of_sample
     assert gap == pytest.approx(0.004 + 2 / 5 * 0.02)
     assert error == pytest.approx(np.hypot(0.0019, 2 / 5 * 0.01), abs=1e-5)
-    row = aims.sample_markdown([found, dataclasses.replace(found, shorter={})], 600.0).splitlines()[4:]
+    row = aims.sample_markdown(
+        [found, *(dataclasses.replace(found, shorter=few) for few in ({}, {1: 0.01}))], 600.0
+    ).splitlines()[4:]
     assert row == [f"| 50, 5 | 2 | 2.000 ± 1.000 | 1.20 ± {100 * error:.2f} | no |"]
 
 
