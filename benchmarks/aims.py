@@ -229,8 +229,8 @@ def markdown(found: list[Measured]) -> str:
 def sample_markdown(found: list[Measured], seconds: float) -> str:
     """What far longer runs of some instances say of the best known tours, a row for each aim that has two or more."""
     lines = [
-        f"Runs of {seconds:g} s, on instances drawn from those that are not proved, and the mean gap if the best known "
-        "tours of the others gave way as much:",
+        f"Runs of {seconds:g} s (`--sample`), on instances drawn from those that are not proved, and the mean gap if "
+        "the best known tours of the others gave way as much:",
         "",
         "| n, m | instances | best known tours became shorter by, % | gap then, % | met |",
         "|---|---|---|---|---|",

@@ -41,7 +41,7 @@ def main(minutes: float = 30.0, folder: Path = Path("runs/curves"), out: Path = 
         raise ValueError(f"minutes must be above 0, got {minutes!r}")
     common = SIZE | {"threads": 1, "tensorboard": False, "network": QUICK.network, "steps": 10**9}
     runs = {
-        "REINFORCE from scratch": (reinforce, replace(QUICK, out=folder / "reinforce", **common)),
+        "REINFORCE from scratch": (reinforce, replace(QUICK, out=folder / "reinforce", validate_every=10, **common)),
         "imitation": (imitate, ImitateConfig(out=folder / "imitate", workers=0, validate_every=50, **common)),
     }
     curves = {}

@@ -15,6 +15,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from dan_policy import single
 from dan_policy.actor import make_actor
 from dan_policy.episode import Decode, find_device, rollout
 from dan_policy.network import DAN
@@ -129,8 +130,8 @@ def solve(
         state = _set_out(instance, game, prefixes or [])
         if rules.all_visited(state)[0]:
             tours = rules.tours(state.visits[0], state.destination[0])
-        elif rows == 1 and decode == "greedy" and isinstance(policy, DAN) and device.type == "cpu":
-            tours = _play_alone(policy, state, game)
+        elif rows == 1 and decode == "greedy" and precision == "float32" and single.can_play(policy, device):
+            tours = single.play(policy, state, game)
         else:
             tours = _play(policy, _side_by_side(state, rows, augment, device), decode, seed)
     if polish is not None:
@@ -189,16 +190,6 @@ def _play(policy: nn.Module, start: TensorDict, decode: Decode, seed: int) -> To
         last = rollout(actor, env, decode, start).last
     best = env.makespan(last).argmin()[None]
     return env.tours(last[best])[0]
-
-
-@torch.inference_mode()
-def _play_alone(network: DAN, state: rules.State, game: rules.Rules) -> Tours:
-    """One greedy game, the same as ``_play``'s, with the rules on NumPy arrays: replanning takes half the time."""
-    while not rules.all_visited(state)[0]:
-        seen = rules.observe(state, game)
-        logits = network(*(torch.from_numpy(part) for part in (seen.cities, seen.agents, seen.visited)))  # (1, n)
-        state = rules.depart(state, game, np.where(seen.action_mask, logits.numpy(), -np.inf).argmax(1))
-    return rules.tours(state.visits[0], state.destination[0])
 
 
 def _ready(policy: str | os.PathLike | nn.Module, device: torch.device) -> nn.Module:

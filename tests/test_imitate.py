@@ -230,6 +230,16 @@ def test_resume_is_bit_identical(tmp_path, monkeypatch, student):
     assert whole["progress"]["best"] == parts["progress"]["best"]
 
 
+def test_a_run_does_not_go_on_with_another_student(tmp_path, student):
+    run = replace(student, out=tmp_path / "run", steps=2)
+    imitate(run)
+    torch.manual_seed(4)
+    save(tmp_path / "student.safetensors", DAN(TINY.network))
+    with pytest.raises(ValueError, match=r"roll_in='.*student.safetensors' holds other weights than when the run beg"):
+        imitate(replace(run, steps=3, resume=True))
+    assert checkpoint.read(tmp_path / "run" / "checkpoint.pt")["progress"]["step"] == 2
+
+
 def test_imitation_learns_what_the_teacher_does(tmp_path):
     """A few seconds in small: 150 steps at n = 10, m = 2 lower the greedy cost on held-out instances."""
     config = replace(

@@ -307,6 +307,19 @@ def test_a_run_is_not_overwritten_nor_resumed_as_another(tmp_path):
     check_same_run(TINY.to_dict(), replace(TINY, steps=99, seconds=1.0))
 
 
+def test_a_checkpoint_may_be_older_than_an_option():
+    """What it does not know had its default, then and now."""
+    older = TINY.to_dict()
+    del older["average"], older["network"]["view"]
+    check_same_run(older, TINY)
+    for changed in (
+        replace(TINY, average=0.5),
+        replace(TINY, network=replace(TINY.network, prune_visited=True, view=5)),
+    ):
+        with pytest.raises(ValueError, match=r"average was 0\.0, is 0\.5|network was .*'view': None"):
+            check_same_run(older, changed)
+
+
 def test_a_damaged_checkpoint_is_refused(tmp_path):
     path = tmp_path / "checkpoint.pt"
     checkpoint.write(path, {"a": torch.zeros(1000)})

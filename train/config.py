@@ -254,9 +254,13 @@ class ImitateConfig(RunConfig):
 
 
 def check_same_run(old: dict, config: RunConfig) -> None:
-    """Raise ValueError where ``config`` would change what an interrupted run was training."""
-    new = config.to_dict()
-    changed = [k for k in new if k not in FREE_ON_RESUME and old.get(k) != new[k]]
+    """Raise ValueError where ``config`` would change what an interrupted run was training.
+
+    Options that are younger than its checkpoint had their default.
+    """
+    new, default = config.to_dict(), type(config)().to_dict()
+    old = default | old | {"network": asdict(DANConfig()) | old["network"]}
+    changed = [k for k in new if k not in FREE_ON_RESUME and old[k] != new[k]]
     if changed:
-        said = ", ".join(f"{k} was {old.get(k)!r}, is {new[k]!r}" for k in changed)
+        said = ", ".join(f"{k} was {old[k]!r}, is {new[k]!r}" for k in changed)
         raise ValueError(f"a resumed run keeps its configuration: {said}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import multiprocessing
 import os
@@ -100,6 +101,7 @@ class Buffer:
 
     def __init__(self, config: ImitateConfig, rng: np.random.Generator):
         self.config, self.rng = config, rng
+        self.student = None if config.roll_in is None else hashlib.sha256(find(config.roll_in).read_bytes()).hexdigest()
         self.indices: list[int] = []  # of the sets at hand
         self.left: list[list[int]] = []  # decision indices of each that are yet to be learnt from
         self.sets: list[tuple[TensorDictBase, Tensor]] = []  # decisions [T, B], valid (T, B)
@@ -146,10 +148,22 @@ class Buffer:
 
     def state_dict(self) -> dict[str, Any]:
         """Which sets are at hand, and what is left of each."""
-        return {"indices": self.indices, "left": self.left, "next": self.next, "instances": self.instances}
+        return {
+            "indices": self.indices,
+            "left": self.left,
+            "next": self.next,
+            "instances": self.instances,
+            "student": self.student,
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Make the same sets again."""
+        """Make the same sets again.
+
+        Raises:
+            ValueError: the student that played in them is another one now.
+        """
+        if state.get("student", self.student) != self.student:  # older checkpoints do not say
+            raise ValueError(f"roll_in={self.config.roll_in!r} holds other weights than when the run began")
         self.indices, self.left = list(state["indices"]), [list(left) for left in state["left"]]
         self.sets = [replay(self._made(index), self.config) for index in self.indices]
         self._pending.clear()

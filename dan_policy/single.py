@@ -1,0 +1,135 @@
+"""One greedy game on a CPU, as soon as can be.
+
+``network.DAN`` takes batches, trains, and runs anywhere. With one row of a few nodes most of its time goes into calling
+operators, not into them; here is the same forward pass for a single observation with fewer of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from dan_policy.network import DAN, AttentionLayer
+from mtsp_env import rules
+from mtsp_env.instance import Tours
+
+Logits = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+
+def can_play(policy: nn.Module, device: torch.device) -> bool:
+    """Whether ``play`` is for this policy: a DAN, whose forward pass no subclass has changed, on a CPU."""
+    return type(policy) is DAN and device.type == "cpu"
+
+
+def play(network: DAN, state: rules.State, game: rules.Rules) -> Tours:
+    """The likeliest actions from ``state``, one row of NumPy arrays, to the end: what a batched rollout would do.
+
+    Until it returns, PyTorch has one thread in this process.
+    """
+    logits = forward_pass(network)
+    with _one_thread():
+        while not rules.all_visited(state)[0]:
+            seen = rules.observe(state, game)
+            u = logits(seen.cities[0], seen.agents[0], seen.visited[0])
+            state = rules.depart(state, game, np.where(seen.action_mask[0], u, -np.inf).argmax(keepdims=True))
+    return rules.tours(state.visits[0], state.destination[0])
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """PyTorch with one thread: to share matrices of so few rows takes longer than to multiply them."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@torch.inference_mode()
+def forward_pass(network: DAN) -> Logits:
+    """The network, float32 on a CPU, as a function of NumPy arrays: cities (n, 2), agents (m, 3) float32, visited (n,)
+    bool -> logits (n,) float32, those of ``DAN.forward`` up to rounding, where they mean something."""
+    config, d = network.config, network.config.embed_dim
+    encode_cities, encode_agents, attend_agents = (
+        [_layer(layer) for layer in layers]
+        for layers in (network.city_encoder, network.agent_encoder, network.city_agent_encoder)
+    )
+    state_layer, glimpse_layer = _layer(network.state_layer), _layer(network.glimpse_layer)
+    (depot_w, depot_b), (city_w, city_b), (agent_w, agent_b) = (
+        (_columns(embed.weight), embed.bias) for embed in (network.embed_depot, network.embed_city, network.embed_agent)
+    )
+    pointer_query, pointer_key = _columns(network.pointer_query.weight) * d**-0.5, _columns(network.pointer_key.weight)
+
+    def logits(cities: np.ndarray, agents: np.ndarray, visited: np.ndarray) -> np.ndarray:
+        kept = _in_view(cities, visited, config.view) if config.prune_visited else np.arange(len(visited))
+        closed = None if config.prune_visited else torch.from_numpy(visited)
+        x = torch.from_numpy(cities[kept])
+        h_c = torch.cat([torch.addmm(depot_b, x[:1], depot_w), torch.addmm(city_b, x[1:], city_w)])  # (k, d)
+        for layer in encode_cities:
+            h_c = layer(h_c, h_c, None)
+        h_a = torch.addmm(agent_b, torch.from_numpy(agents), agent_w)  # (m, d)
+        for layer in encode_agents:
+            h_a = layer(h_a, h_a, None)
+        h_ca = h_c
+        for layer in attend_agents:
+            h_ca = layer(h_ca, h_a, None)
+        h_s = state_layer(h_c.mean(0, keepdim=True), h_a, None)  # (1, d)
+        h_f = glimpse_layer(h_s, h_ca, closed)
+        u = torch.mm(torch.mm(h_f, pointer_query), torch.mm(h_ca, pointer_key).t())  # (1, k)
+        found = np.full(len(visited), -config.tanh_clip, dtype=np.float32)
+        found[kept] = torch.tanh(u)[0].numpy() * config.tanh_clip
+        return found
+
+    return torch.inference_mode()(logits)
+
+
+def _in_view(cities: np.ndarray, visited: np.ndarray, view: int | None) -> np.ndarray:
+    """(k,) Open nodes, the depot first; of more than ``view`` cities the nearest."""
+    kept = np.flatnonzero(~visited)
+    if view is None or len(kept) <= 1 + view:
+        return kept
+    distance = np.square(cities[kept[1:]]).sum(1)
+    return np.append(0, kept[1:][np.argpartition(distance, view - 1)[:view]])
+
+
+def _layer(layer: AttentionLayer) -> Callable[[Tensor, Tensor, Tensor | None], Tensor]:
+    """Query (q, d), source (k, d), and the keys (k,) bool not to attend to -> (q, d)."""
+    heads, d = layer.n_heads, layer.query.in_features
+    width, pre = d // heads, layer.norm == "pre"
+    query, key_value = _columns(layer.query.weight) * width**-0.5, _columns(layer.key_value.weight)
+    out = _columns(layer.out.weight)
+    up, down = layer.feedforward[0], layer.feedforward[2]
+    up_w, up_b, down_w, down_b = _columns(up.weight), up.bias, _columns(down.weight), down.bias
+    first, second = ((norm.weight, norm.bias) for norm in (layer.norm_attention, layer.norm_feedforward))
+
+    def attend(h: Tensor, x: Tensor, source: Tensor, closed: Tensor | None) -> Tensor:
+        q = torch.mm(x, query).view(-1, heads, width).transpose(0, 1)  # (heads, q, width)
+        k, v = torch.mm(source, key_value).view(-1, 2 * heads, width).transpose(0, 1).split(heads)
+        u = torch.bmm(q, k.transpose(1, 2))  # two products: the fused kernel is slower for so few rows
+        if closed is not None:
+            u.masked_fill_(closed, -torch.inf)
+        mixed = torch.bmm(torch.softmax(u, 2), v)
+        return torch.addmm(h, mixed.transpose(0, 1).reshape(-1, d), out)
+
+    def feed(h: Tensor, x: Tensor) -> Tensor:
+        return torch.addmm(down_b, torch.relu_(torch.addmm(up_b, x, up_w)), down_w).add_(h)
+
+    def forward(h: Tensor, source: Tensor, closed: Tensor | None) -> Tensor:
+        if pre:
+            x = torch.layer_norm(h, (d,), *first)
+            h = attend(h, x, x if source is h else torch.layer_norm(source, (d,), *first), closed)
+            return feed(h, torch.layer_norm(h, (d,), *second))
+        h = torch.layer_norm(attend(h, h, source, closed), (d,), *first)
+        return torch.layer_norm(feed(h, h), (d,), *second)
+
+    return forward
+
+
+def _columns(weight: Tensor) -> Tensor:
+    """(out, in) -> (in, out), contiguous: nothing to copy where it lies in memory by columns already."""
+    return weight.t().contiguous()
