@@ -8,16 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from dan_policy.network import DAN, AttentionLayer
 from mtsp_env import rules
 from mtsp_env.instance import Tours
 
 Logits = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+MANY, STEP = 64, 16  # rows from which oneDNN's products pay, where they do, and what their number is a multiple of
 
 
 def can_play(policy: nn.Module, device: torch.device) -> bool:
@@ -68,19 +71,19 @@ def forward_pass(network: DAN) -> Logits:
     def logits(cities: np.ndarray, agents: np.ndarray, visited: np.ndarray) -> np.ndarray:
         kept = _in_view(cities, visited, config.view) if config.prune_visited else np.arange(len(visited))
         closed = None if config.prune_visited else torch.from_numpy(visited)
-        x = torch.from_numpy(cities[kept])
-        h_c = torch.cat([torch.addmm(depot_b, x[:1], depot_w), torch.addmm(city_b, x[1:], city_w)])  # (k, d)
+        x, k, m = _padded(torch.from_numpy(cities[kept])), len(kept), len(agents)
+        h_c = torch.cat([torch.addmm(depot_b, x[:1], depot_w), torch.addmm(city_b, x[1:], city_w)])  # (at least k, d)
         for layer in encode_cities:
-            h_c = layer(h_c, h_c, None)
+            h_c = layer(h_c, h_c, k, None)
         h_a = torch.addmm(agent_b, torch.from_numpy(agents), agent_w)  # (m, d)
         for layer in encode_agents:
-            h_a = layer(h_a, h_a, None)
+            h_a = layer(h_a, h_a, m, None)
         h_ca = h_c
         for layer in attend_agents:
-            h_ca = layer(h_ca, h_a, None)
-        h_s = state_layer(h_c.mean(0, keepdim=True), h_a, None)  # (1, d)
-        h_f = glimpse_layer(h_s, h_ca, closed)
-        u = torch.mm(torch.mm(h_f, pointer_query), torch.mm(h_ca, pointer_key).t())  # (1, k)
+            h_ca = layer(h_ca, h_a, m, None)
+        h_s = state_layer(h_c[:k].mean(0, keepdim=True), h_a, m, None)  # (1, d)
+        h_f = glimpse_layer(h_s, h_ca, k, closed)
+        u = torch.mm(torch.mm(h_f, pointer_query), torch.mm(h_ca[:k], pointer_key).t())  # (1, k)
         found = np.full(len(visited), -config.tanh_clip, dtype=np.float32)
         found[kept] = torch.tanh(u)[0].numpy() * config.tanh_clip
         return found
@@ -97,37 +100,67 @@ def _in_view(cities: np.ndarray, visited: np.ndarray, view: int | None) -> np.nd
     return np.append(0, kept[1:][np.argpartition(distance, view - 1)[:view]])
 
 
-def _layer(layer: AttentionLayer) -> Callable[[Tensor, Tensor, Tensor | None], Tensor]:
-    """Query (q, d), source (k, d), and the keys (k,) bool not to attend to -> (q, d)."""
+def _padded(x: Tensor) -> Tensor:
+    """x (k, 2), and below it rows that nobody looks at: oneDNN builds a kernel for each shape, so there must be few."""
+    short = -len(x) % STEP
+    return F.pad(x, (0, 0, 0, short)) if short and len(x) >= MANY and _onednn_is_faster() else x
+
+
+def _layer(layer: AttentionLayer) -> Callable[[Tensor, Tensor, int, Tensor | None], Tensor]:
+    """Query (q, d), source (at least k, d), how many keys there are, and which (k,) bool not to attend to -> (q, d)."""
     heads, d = layer.n_heads, layer.query.in_features
     width, pre = d // heads, layer.norm == "pre"
-    query, key_value = _columns(layer.query.weight) * width**-0.5, _columns(layer.key_value.weight)
-    out = _columns(layer.out.weight)
-    up, down = layer.feedforward[0], layer.feedforward[2]
-    up_w, up_b, down_w, down_b = _columns(up.weight), up.bias, _columns(down.weight), down.bias
+    query, key_value = _product(layer.query.weight * width**-0.5), _product(layer.key_value.weight)
+    out = _product(layer.out.weight)
+    up, down = (_product(part.weight, part.bias) for part in (layer.feedforward[0], layer.feedforward[2]))
     first, second = ((norm.weight, norm.bias) for norm in (layer.norm_attention, layer.norm_feedforward))
 
-    def attend(h: Tensor, x: Tensor, source: Tensor, closed: Tensor | None) -> Tensor:
-        q = torch.mm(x, query).view(-1, heads, width).transpose(0, 1)  # (heads, q, width)
-        k, v = torch.mm(source, key_value).view(-1, 2 * heads, width).transpose(0, 1).split(heads)
+    def attend(h: Tensor, x: Tensor, source: Tensor, count: int, closed: Tensor | None) -> Tensor:
+        q = query(x).view(-1, heads, width).transpose(0, 1)  # (heads, q, width)
+        k, v = key_value(source)[:count].view(-1, 2 * heads, width).transpose(0, 1).split(heads)
         u = torch.bmm(q, k.transpose(1, 2))  # two products: the fused kernel is slower for so few rows
         if closed is not None:
             u.masked_fill_(closed, -torch.inf)
         mixed = torch.bmm(torch.softmax(u, 2), v)
-        return torch.addmm(h, mixed.transpose(0, 1).reshape(-1, d), out)
+        return out(mixed.transpose(0, 1).reshape(-1, d)).add_(h)
 
     def feed(h: Tensor, x: Tensor) -> Tensor:
-        return torch.addmm(down_b, torch.relu_(torch.addmm(up_b, x, up_w)), down_w).add_(h)
+        return down(torch.relu_(up(x))).add_(h)
 
-    def forward(h: Tensor, source: Tensor, closed: Tensor | None) -> Tensor:
+    def forward(h: Tensor, source: Tensor, count: int, closed: Tensor | None) -> Tensor:
         if pre:
             x = torch.layer_norm(h, (d,), *first)
-            h = attend(h, x, x if source is h else torch.layer_norm(source, (d,), *first), closed)
+            h = attend(h, x, x if source is h else torch.layer_norm(source, (d,), *first), count, closed)
             return feed(h, torch.layer_norm(h, (d,), *second))
-        h = torch.layer_norm(attend(h, h, source, closed), (d,), *first)
+        h = torch.layer_norm(attend(h, h, source, count, closed), (d,), *first)
         return torch.layer_norm(feed(h, h), (d,), *second)
 
     return forward
+
+
+def _product(weight: Tensor, bias: Tensor | None = None) -> Callable[[Tensor], Tensor]:
+    """x (k, in) -> (k, out), by whichever library is faster for so many rows."""
+    columns = _columns(weight)
+    onednn, packed = _onednn_is_faster(), None
+
+    def product(x: Tensor) -> Tensor:
+        nonlocal packed
+        if onednn and len(x) >= MANY:
+            if packed is None:
+                packed = torch.ops.mkldnn._reorder_linear_weight(weight.contiguous(), MANY)
+            return torch.ops.mkldnn._linear_pointwise(x, packed, bias, "none", [], "")
+        return torch.mm(x, columns) if bias is None else torch.addmm(bias, x, columns)
+
+    return product
+
+
+@cache
+def _onednn_is_faster() -> bool:
+    """Whether oneDNN multiplies many float32 rows faster than MKL, PyTorch's choice: up to twice, with AVX-512 on
+    processors that are not Intel's, where MKL makes do with AVX2."""
+    cpu = getattr(torch.cpu, "get_capabilities", dict)()
+    foreign = cpu.get("avx512_f", False) and "intel" not in cpu.get("cpu_name", "intel").lower()
+    return foreign and torch.backends.mkl.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 
 
 def _columns(weight: Tensor) -> Tensor:

@@ -147,10 +147,11 @@ def solve(
 
 @cache
 def _multiplies_bfloat16(device: torch.device) -> bool:
-    """Whether the device has matrix units for bfloat16."""
+    """Whether the device multiplies bfloat16 faster than float32."""
     if device.type == "cuda":
         return torch.cuda.get_device_capability(device) >= (8, 0)
-    return device.type == "cpu" and bool(getattr(torch.cpu, "get_capabilities", dict)().get("amx_bf16"))
+    cpu = getattr(torch.cpu, "get_capabilities", dict)() if device.type == "cpu" else {}
+    return bool(cpu.get("amx_bf16") or cpu.get("avx512_bf16"))
 
 
 def _polish(seconds: float, seed: int, prefixes: Tours | None) -> Callable[[Instance, Tours], Tours]:

@@ -239,7 +239,13 @@ def test_bfloat16_is_for_hardware_and_sizes_that_gain(monkeypatch, kwargs, n_nod
 
 
 @pytest.mark.parametrize(
-    ("capabilities", "expected"), [({"amx_bf16": True}, True), ({"amx_bf16": False}, False), ({}, False)]
+    ("capabilities", "expected"),
+    [
+        ({"amx_bf16": True}, True),
+        ({"avx512_bf16": True}, True),
+        ({"amx_bf16": False, "avx512_f": True}, False),
+        ({}, False),
+    ],
 )
 def test_matrix_units_are_what_the_cpu_says(monkeypatch, capabilities, expected):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities, raising=False)

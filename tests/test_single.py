@@ -76,3 +76,49 @@ def test_a_forward_pass_of_one_row_is_the_networks(
     found = single.forward_pass(network)(seen.numpy(), team.numpy(), visited.numpy())
     is_open = ~visited.numpy()
     np.testing.assert_allclose(found[is_open], expected[is_open], rtol=0, atol=2e-4)
+
+
+@pytest.mark.skipif(not hasattr(torch.ops.mkldnn, "_linear_pointwise"), reason="this PyTorch has no oneDNN")
+@pytest.mark.parametrize("norm", ["pre", "post"])
+@pytest.mark.parametrize("prune", [False, True])
+@pytest.mark.parametrize("n_nodes", [3, 4, 5, 8, 9, 23])
+def test_products_of_onednn_and_their_padding_change_nothing(monkeypatch, norm, prune, n_nodes):
+    rows, linear = [], torch.ops.mkldnn._linear_pointwise
+
+    def counted(x, *others):
+        rows.append(len(x))
+        return linear(x, *others)
+
+    monkeypatch.setattr(single, "_onednn_is_faster", lambda: True)
+    monkeypatch.setattr(single, "MANY", 4)
+    monkeypatch.setattr(single, "STEP", 4)
+    monkeypatch.setattr(torch.ops.mkldnn, "_linear_pointwise", counted)
+    torch.manual_seed(n_nodes)
+    network = DAN(DANConfig(16, 24, 2, 2, 1, 1, norm, norm, 10.0, prune)).eval()
+    seen, team, visited = torch.rand(n_nodes, 2) - 0.5, torch.rand(3, 3), torch.rand(n_nodes) < 0.3
+    visited[0] = False
+    expected = network(seen, team, visited).detach().numpy()
+    found = single.forward_pass(network)(seen.numpy(), team.numpy(), visited.numpy())
+    is_open = ~visited.numpy()
+    np.testing.assert_allclose(found[is_open], expected[is_open], rtol=0, atol=2e-4)
+    k = int(is_open.sum()) if prune else n_nodes
+    assert set(rows) == ({-(-k // 4) * 4} if k >= 4 else set())
+
+
+@pytest.mark.parametrize(
+    ("cpu", "faster"),
+    [
+        ({"avx512_f": True, "cpu_name": "AMD EPYC"}, True),
+        ({"avx512_f": True, "cpu_name": "Intel(R) Xeon(R) Processor"}, False),
+        ({"avx512_f": False, "cpu_name": "AMD EPYC"}, False),
+        ({"avx512_f": True}, False),
+        ({}, False),
+    ],
+)
+def test_onednn_is_for_processors_whose_wide_units_mkl_leaves_alone(monkeypatch, cpu, faster):
+    asked = single._onednn_is_faster.__wrapped__  # what it said of this machine stays cached
+    monkeypatch.setattr(torch.backends.mkl, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: cpu, raising=False)
+    assert asked() == (faster and hasattr(torch.ops.mkldnn, "_linear_pointwise"))
+    monkeypatch.setattr(torch.backends.mkl, "is_available", lambda: False)
+    assert not asked()  # another library multiplies, of which nothing is known

@@ -1,7 +1,6 @@
-"""REINFORCE with a rollout baseline: the gradient is the formula, chunks add up, runs resume bit by bit and learn."""
+"""REINFORCE with a rollout baseline: the gradient is the formula, chunks add up, training helps."""
 
 import itertools
-import signal
 from dataclasses import replace
 
 import numpy as np
@@ -9,36 +8,19 @@ import pytest
 import torch
 from states import same
 from tensordict.nn import TensorDictModule
+from tiny import TINY
 from torch import nn
 from torchrl.objectives import ReinforceLoss
 
-from benchmarks.policies.attention_model import AttentionModel
 from dan_policy import DANConfig, make_actor
 from train import checkpoint
 from train.__main__ import main
 from train.baseline import RolloutBaseline, SharedBaseline, better
 from train.collect import Instances, costs, draw, draw_set, play, repeat
-from train.config import ReinforceConfig, check_same_run
+from train.config import ReinforceConfig
 from train.loss import EpisodicReinforceLoss, backward, decisions_with_advantage, log_probs, subsample
-from train.presets import PAPER, QUICK
+from train.presets import PAPER
 from train.reinforce import Trainer, reinforce
-
-TINY = replace(
-    QUICK,
-    n_nodes=(5, 8),
-    n_agents=(1, 3),
-    batch_size=6,
-    network=DANConfig(embed_dim=16, feedforward_dim=32, n_heads=2, city_layers=1, prune_visited=True),
-    challenge_every=2,
-    challenge_instances=8,
-    validate_every=2,
-    validation_instances=8,
-    checkpoint_every=2,
-    decay=0.5,
-    decay_every=2,
-    steps=6,
-    tensorboard=False,
-)
 
 
 class Preferences(nn.Module):
@@ -253,20 +235,6 @@ def test_drawn_sizes_cover_their_ranges():
     assert sum(len(part.nodes) for part in draw_set(rng, TINY, 21)) == 21
 
 
-@pytest.mark.parametrize("average", [0.0, 0.9])
-def test_resume_is_bit_identical(tmp_path, average):
-    config = replace(TINY, average=average)
-    reinforce(replace(config, out=tmp_path / "whole"))
-    reinforce(replace(config, out=tmp_path / "parts", steps=3))
-    torch.manual_seed(123)  # whatever happened in between
-    reinforce(replace(config, out=tmp_path / "parts", resume=True))
-    whole, parts = (checkpoint.read(tmp_path / name / "checkpoint.pt") for name in ("whole", "parts"))
-    for key in ("network", "average", "optimiser", "schedule", "baseline", "random"):
-        assert same(whole[key], parts[key]), key
-    for key in ("step", "instances", "best"):
-        assert whole["progress"][key] == parts["progress"][key], key
-
-
 def test_the_policy_is_the_running_average_of_the_weights(tmp_path):
     plain, averaged = (Trainer(replace(TINY, out=tmp_path / str(decay), average=decay)) for decay in (0.0, 0.75))
     expected: dict[str, torch.Tensor] = {}
@@ -279,63 +247,6 @@ def test_the_policy_is_the_running_average_of_the_weights(tmp_path):
     kept = averaged.policy().state_dict()
     assert max(float((kept[name] - weight).abs().max()) for name, weight in expected.items()) < 1e-6
     assert not same(dict(kept), dict(averaged.network.state_dict()))
-
-
-def test_an_interrupt_finishes_the_step_and_saves(tmp_path, monkeypatch):
-    def step_then_interrupt(self):
-        logs = train_step(self)
-        if self.step == 3:
-            signal.raise_signal(signal.SIGINT)
-        return logs
-
-    train_step = Trainer.train_step
-    monkeypatch.setattr(Trainer, "train_step", step_then_interrupt)
-    before = signal.getsignal(signal.SIGINT)
-    assert reinforce(replace(TINY, out=tmp_path, checkpoint_every=1000)).step == 3
-    assert checkpoint.read(tmp_path / "checkpoint.pt")["progress"]["step"] == 3
-    assert signal.getsignal(signal.SIGINT) is before
-
-
-def test_a_run_is_not_overwritten_nor_resumed_as_another(tmp_path):
-    reinforce(replace(TINY, out=tmp_path, steps=1))
-    with pytest.raises(FileExistsError, match="give --resume"):
-        reinforce(replace(TINY, out=tmp_path))
-    with pytest.raises(ValueError, match="batch_size was 6, is 7"):
-        reinforce(replace(TINY, out=tmp_path, resume=True, batch_size=7))
-    with pytest.raises(FileNotFoundError, match="no checkpoint at"):
-        reinforce(replace(TINY, out=tmp_path / "other", resume=True))
-    check_same_run(TINY.to_dict(), replace(TINY, steps=99, seconds=1.0))
-
-
-def test_a_checkpoint_may_be_older_than_an_option():
-    """What it does not know had its default, then and now."""
-    older = TINY.to_dict()
-    del older["average"], older["network"]["view"]
-    check_same_run(older, TINY)
-    for changed in (
-        replace(TINY, average=0.5),
-        replace(TINY, network=replace(TINY.network, prune_visited=True, view=5)),
-    ):
-        with pytest.raises(ValueError, match=r"average was 0\.0, is 0\.5|network was .*'view': None"):
-            check_same_run(older, changed)
-
-
-def test_a_damaged_checkpoint_is_refused(tmp_path):
-    path = tmp_path / "checkpoint.pt"
-    checkpoint.write(path, {"a": torch.zeros(1000)})
-    path.write_bytes(path.read_bytes()[:500])
-    with pytest.raises(ValueError, match="not a checkpoint, or a damaged one"):
-        checkpoint.read(path)
-
-
-def test_logs_and_weights_are_left_behind(tmp_path):
-    trainer = reinforce(replace(TINY, out=tmp_path, tensorboard=True))
-    cost = np.loadtxt(tmp_path / "logs/scalars/cost.csv", delimiter=",")
-    assert cost[:, 0].tolist() == [1, 2, 3, 4, 5, 6]
-    assert {p.name for p in tmp_path.glob("*.safetensors")} == {"best.safetensors", "last.safetensors"}
-    assert list(tmp_path.glob("tensorboard/events*"))
-    continued = Trainer(replace(TINY, init=str(tmp_path / "last.safetensors")))
-    assert same(dict(continued.network.state_dict()), dict(trainer.network.state_dict()))
 
 
 def test_training_lowers_the_greedy_cost_on_held_out_instances(tmp_path):
@@ -371,18 +282,6 @@ def test_training_lowers_the_greedy_cost_on_held_out_instances(tmp_path):
 def test_bad_configurations_are_named(kwargs, message):
     with pytest.raises(ValueError, match=message):
         ReinforceConfig(**kwargs)
-
-
-def test_a_network_of_ones_own_is_trained_saved_and_continued(tmp_path):
-    policy = "benchmarks.policies.attention_model:AttentionModel"
-    trainer = reinforce(replace(TINY, out=tmp_path, policy=policy, steps=2))
-    assert isinstance(trainer.network, AttentionModel)
-    again = Trainer(replace(TINY, policy=policy, init=str(tmp_path / "last.safetensors")))
-    assert same(dict(again.network.state_dict()), dict(trainer.network.state_dict()))
-    with pytest.raises(ValueError, match="it holds no DAN"):
-        Trainer(replace(TINY, init=str(tmp_path / "last.safetensors")))
-    with pytest.raises(ValueError, match=r"policy must be package.module:factory, got 'nothing.here:at_all'"):
-        Trainer(replace(TINY, policy="nothing.here:at_all"))
 
 
 def test_presets_follow_the_paper():

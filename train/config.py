@@ -59,6 +59,9 @@ class RunConfig:
     """A network of your own instead of a DAN: package.module:factory, called without arguments."""
     init: str | None = None
     """Weights to start from: a file, or the name of a shipped model (its configuration replaces `network`)."""
+    prune_visited: bool | None = None
+    """Whether the DAN of `init` drops visited cities before its encoders from now on, with the same weights. None: as
+    its file says."""
     max_grad_norm: float = 1.0
     average: float = 0.0
     """Decay of the running average of the weights, which is what is validated and saved. 0: the weights as they are."""
@@ -84,6 +87,10 @@ class RunConfig:
         self._check_at_least(1, "steps", "nodes_per_agent", "validate_every", "checkpoint_every")
         self._check_at_least(2, "validation_instances")
         self._check_positive("max_grad_norm", "speed")
+        if self.prune_visited is not None and self.init is None:
+            raise ValueError(
+                f"prune_visited must be None without init, got {self.prune_visited}: set the network's own"
+            )
         if not 0 <= self.average < 1:
             raise ValueError(f"average must be at least 0 and below 1, got {self.average!r}")
         if self.n_agents[0] * self.nodes_per_agent > self.n_nodes[0]:

@@ -10,6 +10,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -121,7 +122,10 @@ def make_network(config: RunConfig) -> nn.Module:
         ValueError: no such factory, or weights that do not fit.
     """
     if config.policy is None:
-        return load(config.init) if config.init else DAN(config.network)
+        network = load(config.init) if config.init else DAN(config.network)
+        if config.prune_visited is not None:
+            network.config = replace(network.config, prune_visited=config.prune_visited)
+        return network
     try:
         network = pkgutil.resolve_name(config.policy)()
     except (ImportError, AttributeError) as error:
