@@ -23,6 +23,8 @@ STYLE = {
     "dan-s64": ("#f46d43", "o"),
     "dan-s64-x8": ("#f46d43", "d"),
     "dan-s256": ("#d73027", "o"),
+    "dan-paper-greedy": ("#fee090", "o"),
+    "dan-paper-s64": ("#fee090", "d"),
     "dan-improve": ("#8c1c13", "P"),
     "reference": ("black", "*"),
     "ortools": ("#4575b4", "s"),

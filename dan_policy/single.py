@@ -112,7 +112,8 @@ def _layer(layer: AttentionLayer) -> Callable[[Tensor, Tensor, int, Tensor | Non
     width, pre = d // heads, layer.norm == "pre"
     query, key_value = _product(layer.query.weight * width**-0.5), _product(layer.key_value.weight)
     out = _product(layer.out.weight)
-    up, down = (_product(part.weight, part.bias) for part in (layer.feedforward[0], layer.feedforward[2]))
+    widen, narrow = layer.feedforward[0], layer.feedforward[2]
+    up, down = _product(widen.weight, widen.bias, "relu"), _product(narrow.weight, narrow.bias)
     first, second = ((norm.weight, norm.bias) for norm in (layer.norm_attention, layer.norm_feedforward))
 
     def attend(h: Tensor, x: Tensor, source: Tensor, count: int, closed: Tensor | None) -> Tensor:
@@ -125,7 +126,7 @@ def _layer(layer: AttentionLayer) -> Callable[[Tensor, Tensor, int, Tensor | Non
         return out(mixed.transpose(0, 1).reshape(-1, d)).add_(h)
 
     def feed(h: Tensor, x: Tensor) -> Tensor:
-        return down(torch.relu_(up(x))).add_(h)
+        return down(up(x)).add_(h)
 
     def forward(h: Tensor, source: Tensor, count: int, closed: Tensor | None) -> Tensor:
         if pre:
@@ -138,8 +139,8 @@ def _layer(layer: AttentionLayer) -> Callable[[Tensor, Tensor, int, Tensor | Non
     return forward
 
 
-def _product(weight: Tensor, bias: Tensor | None = None) -> Callable[[Tensor], Tensor]:
-    """x (k, in) -> (k, out), by whichever library is faster for so many rows."""
+def _product(weight: Tensor, bias: Tensor | None = None, then: str = "none") -> Callable[[Tensor], Tensor]:
+    """x (k, in) -> (k, out), by whichever library is faster for so many rows; ``then`` "relu" or nothing."""
     columns = _columns(weight)
     onednn, packed = _onednn_is_faster(), None
 
@@ -148,8 +149,9 @@ def _product(weight: Tensor, bias: Tensor | None = None) -> Callable[[Tensor], T
         if onednn and len(x) >= MANY:
             if packed is None:
                 packed = torch.ops.mkldnn._reorder_linear_weight(weight.contiguous(), MANY)
-            return torch.ops.mkldnn._linear_pointwise(x, packed, bias, "none", [], "")
-        return torch.mm(x, columns) if bias is None else torch.addmm(bias, x, columns)
+            return torch.ops.mkldnn._linear_pointwise(x, packed, bias, then, [], "")
+        found = torch.mm(x, columns) if bias is None else torch.addmm(bias, x, columns)
+        return found.relu_() if then == "relu" else found
 
     return product
 

@@ -128,6 +128,8 @@ SOLVERS: dict[str, Solver] = {
     "dan-s64": _policy("dan", weights="default", samples=64),
     "dan-s64-x8": _policy("dan", weights="default", samples=64, augment=True),
     "dan-s256": _policy("dan", weights="default", samples=256),
+    "dan-paper-greedy": _policy("dan", weights="paper", policy="paper"),
+    "dan-paper-s64": _policy("dan", weights="paper", policy="paper", samples=64),
     "dan-improve": _policy("improved_dan", "numba", anytime=True, polishes=True, weights="default"),
     "reference": _ours("reference:solve", "numba"),
     "ortools": _ours("ortools:solve", "ortools", search="greedy_descent"),
