@@ -20,6 +20,7 @@ from mtsp_env import rules
 from mtsp_env.instance import Tours
 
 Logits = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+Attention = Callable[[Tensor, Tensor, int, "Tensor | None"], Tensor]
 MANY, STEP = 64, 16  # rows from which oneDNN's products pay, where they do, and what their number is a multiple of
 
 
@@ -59,14 +60,14 @@ def forward_pass(network: DAN) -> Logits:
     bool -> logits (n,) float32, those of ``DAN.forward`` up to rounding, where they mean something."""
     config, d = network.config, network.config.embed_dim
     encode_cities, encode_agents, attend_agents = (
-        [_layer(layer) for layer in layers]
+        [_layer(layer, _of_many) for layer in layers]
         for layers in (network.city_encoder, network.agent_encoder, network.city_agent_encoder)
     )
-    state_layer, glimpse_layer = _layer(network.state_layer), _layer(network.glimpse_layer)
+    state_layer, glimpse_layer = _layer(network.state_layer, _of_one), _layer(network.glimpse_layer, _of_one)
     (depot_w, depot_b), (city_w, city_b), (agent_w, agent_b) = (
         (_columns(embed.weight), embed.bias) for embed in (network.embed_depot, network.embed_city, network.embed_agent)
     )
-    pointer_query, pointer_key = _columns(network.pointer_query.weight) * d**-0.5, _columns(network.pointer_key.weight)
+    pointer = network.pointer_query.weight.t() @ network.pointer_key.weight * d**-0.5
 
     def logits(cities: np.ndarray, agents: np.ndarray, visited: np.ndarray) -> np.ndarray:
         kept = _in_view(cities, visited, config.view) if config.prune_visited else np.arange(len(visited))
@@ -83,7 +84,7 @@ def forward_pass(network: DAN) -> Logits:
             h_ca = layer(h_ca, h_a, m, None)
         h_s = state_layer(h_c[:k].mean(0, keepdim=True), h_a, m, None)  # (1, d)
         h_f = glimpse_layer(h_s, h_ca, k, closed)
-        u = torch.mm(torch.mm(h_f, pointer_query), torch.mm(h_ca[:k], pointer_key).t())  # (1, k)
+        u = torch.mm(torch.mm(h_f, pointer), h_ca[:k].t())  # (1, k)
         found = np.full(len(visited), -config.tanh_clip, dtype=np.float32)
         found[kept] = torch.tanh(u)[0].numpy() * config.tanh_clip
         return found
@@ -106,37 +107,61 @@ def _padded(x: Tensor) -> Tensor:
     return F.pad(x, (0, 0, 0, short)) if short and len(x) >= MANY and _onednn_is_faster() else x
 
 
-def _layer(layer: AttentionLayer) -> Callable[[Tensor, Tensor, int, Tensor | None], Tensor]:
+def _layer(layer: AttentionLayer, attention: Callable[[AttentionLayer], Attention]) -> Attention:
     """Query (q, d), source (at least k, d), how many keys there are, and which (k,) bool not to attend to -> (q, d)."""
-    heads, d = layer.n_heads, layer.query.in_features
-    width, pre = d // heads, layer.norm == "pre"
-    query, key_value = _product(layer.query.weight * width**-0.5), _product(layer.key_value.weight)
-    out = _product(layer.out.weight)
+    d, pre = layer.query.in_features, layer.norm == "pre"
+    mix, out = attention(layer), _product(layer.out.weight)
     widen, narrow = layer.feedforward[0], layer.feedforward[2]
     up, down = _product(widen.weight, widen.bias, "relu"), _product(narrow.weight, narrow.bias)
     first, second = ((norm.weight, norm.bias) for norm in (layer.norm_attention, layer.norm_feedforward))
 
-    def attend(h: Tensor, x: Tensor, source: Tensor, count: int, closed: Tensor | None) -> Tensor:
+    def forward(h: Tensor, source: Tensor, count: int, closed: Tensor | None) -> Tensor:
+        if pre:
+            x = torch.layer_norm(h, (d,), *first)
+            source = x if source is h else torch.layer_norm(source, (d,), *first)
+            h = out(mix(x, source, count, closed)).add_(h)
+            return down(up(torch.layer_norm(h, (d,), *second))).add_(h)
+        h = torch.layer_norm(out(mix(h, source, count, closed)).add_(h), (d,), *first)
+        return torch.layer_norm(down(up(h)).add_(h), (d,), *second)
+
+    return forward
+
+
+def _of_many(layer: AttentionLayer) -> Attention:
+    """softmax(q k' / sqrt(width)) v, heads side by side: (q, d) before the output projection."""
+    heads, d = layer.n_heads, layer.query.in_features
+    width = d // heads
+    query, key_value = _product(layer.query.weight * width**-0.5), _product(layer.key_value.weight)
+
+    def mix(x: Tensor, source: Tensor, count: int, closed: Tensor | None) -> Tensor:
         q = query(x).view(-1, heads, width).transpose(0, 1)  # (heads, q, width)
         k, v = key_value(source)[:count].view(-1, 2 * heads, width).transpose(0, 1).split(heads)
         u = torch.bmm(q, k.transpose(1, 2))  # two products: the fused kernel is slower for so few rows
         if closed is not None:
             u.masked_fill_(closed, -torch.inf)
-        mixed = torch.bmm(torch.softmax(u, 2), v)
-        return out(mixed.transpose(0, 1).reshape(-1, d)).add_(h)
+        return torch.bmm(torch.softmax(u, 2), v).transpose(0, 1).reshape(-1, d)
 
-    def feed(h: Tensor, x: Tensor) -> Tensor:
-        return down(up(x)).add_(h)
+    return mix
 
-    def forward(h: Tensor, source: Tensor, count: int, closed: Tensor | None) -> Tensor:
-        if pre:
-            x = torch.layer_norm(h, (d,), *first)
-            h = attend(h, x, x if source is h else torch.layer_norm(source, (d,), *first), count, closed)
-            return feed(h, torch.layer_norm(h, (d,), *second))
-        h = torch.layer_norm(attend(h, h, source, count, closed), (d,), *first)
-        return torch.layer_norm(feed(h, h), (d,), *second)
 
-    return forward
+def _of_one(layer: AttentionLayer) -> Attention:
+    """The same for one query (1, d), without keys and values: q (s K)' is (q K') s', and p (s V) is (p s) V."""
+    heads, d = layer.n_heads, layer.query.in_features
+    width = d // heads
+    query = _columns(layer.query.weight) * width**-0.5
+    key, value = layer.key_value.weight.reshape(2, heads, width, d)
+    value = value.transpose(1, 2).contiguous()  # (heads, d, width)
+
+    def mix(x: Tensor, source: Tensor, count: int, closed: Tensor | None) -> Tensor:
+        source = source[:count]
+        q = torch.bmm(torch.mm(x, query).view(heads, 1, width), key)  # (heads, 1, d)
+        u = torch.mm(q[:, 0], source.t())  # (heads, k)
+        if closed is not None:
+            u.masked_fill_(closed, -torch.inf)
+        mixed = torch.mm(torch.softmax(u, 1), source)  # (heads, d)
+        return torch.bmm(mixed[:, None], value).view(1, d)
+
+    return mix
 
 
 def _product(weight: Tensor, bias: Tensor | None = None, then: str = "none") -> Callable[[Tensor], Tensor]:
