@@ -67,6 +67,7 @@ def forward_pass(network: DAN) -> Logits:
     (depot_w, depot_b), (city_w, city_b), (agent_w, agent_b) = (
         (_columns(embed.weight), embed.bias) for embed in (network.embed_depot, network.embed_city, network.embed_agent)
     )
+    # The pointer has one query, too: it is carried to what its keys are made of (see _of_one)
     pointer = network.pointer_query.weight.t() @ network.pointer_key.weight * d**-0.5
 
     def logits(cities: np.ndarray, agents: np.ndarray, visited: np.ndarray) -> np.ndarray:

@@ -82,8 +82,7 @@ def solve(
             makes them worse (extra ``reference``). None: the tours stay as they are.
         precision: of the network's matrix products. "auto": "bfloat16" where the device has units for it and the games
             hold enough nodes to gain (about twice as fast for 64 samples on CPUs with AMX or AVX-512 BF16, equally good
-            tours), for a DAN;
-            "float32" elsewhere, and for tours that do not depend on the device.
+            tours), for a DAN; "float32" elsewhere, and for tours that do not depend on the device.
         clip: C to sample with, above 0: the larger, the surer the likelier actions are drawn. None: ``sample_clip``.
         view: how many cities a deciding agent sees at most, the nearest unvisited ones, at least 1: the fewer, the
             sooner a plan is there. For a DAN with ``prune_visited``. None: its configuration's, else ``default_view``,

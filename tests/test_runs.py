@@ -107,5 +107,6 @@ def test_the_same_weights_may_begin_to_drop_visited_cities_or_cease_to(tmp_path)
         after = Trainer(replace(TINY, init=str(tmp_path / "last.safetensors"), prune_visited=prune)).network
         assert after.config == replace(before.config, prune_visited=expected)
         assert same(dict(after.state_dict()), dict(before.state_dict()))
-    with pytest.raises(ValueError, match="prune_visited must be None without init, got False"):
-        ReinforceConfig(prune_visited=False)
+    for other in ({}, {"init": "default", "policy": "package.module:factory"}):
+        with pytest.raises(ValueError, match="prune_visited must be None but for a DAN from init, got False"):
+            ReinforceConfig(prune_visited=False, **other)

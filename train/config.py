@@ -87,10 +87,8 @@ class RunConfig:
         self._check_at_least(1, "steps", "nodes_per_agent", "validate_every", "checkpoint_every")
         self._check_at_least(2, "validation_instances")
         self._check_positive("max_grad_norm", "speed")
-        if self.prune_visited is not None and self.init is None:
-            raise ValueError(
-                f"prune_visited must be None without init, got {self.prune_visited}: set the network's own"
-            )
+        if self.prune_visited is not None and (self.init is None or self.policy is not None):
+            raise ValueError(f"prune_visited must be None but for a DAN from init, got {self.prune_visited}")
         if not 0 <= self.average < 1:
             raise ValueError(f"average must be at least 0 and below 1, got {self.average!r}")
         if self.n_agents[0] * self.nodes_per_agent > self.n_nodes[0]:
