@@ -72,7 +72,7 @@ class RunConfig:
     checkpoint_every: int = 128
 
     precision: Literal["float32", "bfloat16"] = "float32"
-    """bfloat16 autocast pays on GPUs and on CPUs with AMX."""
+    """bfloat16 autocast pays on GPUs and on CPUs with AMX or AVX-512 BF16."""
     device: str = "cpu"
     threads: int | None = None
     """CPU threads of PyTorch; none: PyTorch's own choice."""
