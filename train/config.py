@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-from dan_policy.network import DANConfig
+from dan_policy.dan import DANConfig
 from mtsp_env.instance import check_count, check_distribution
 
 # May differ between a run and its continuation; everything else is part of what is being trained.
