@@ -3,14 +3,16 @@
 from importlib import import_module
 
 _HOMES = {
-    "DAN": "network",
-    "AttentionLayer": "network",
-    "DANConfig": "network",
+    "DAN": "dan",
+    "DANConfig": "dan",
+    "AttentionLayer": "layers",
     "make_actor": "actor",
     "Episode": "episode",
     "rollout": "episode",
-    "load": "weights",
-    "save": "weights",
+    "NETWORKS": "registry",
+    "build": "registry",
+    "load": "registry",
+    "save": "registry",
     "Solution": "solution",
     "solve": "solution",
 }

@@ -15,12 +15,11 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from dan_policy import single
 from dan_policy.actor import make_actor
+from dan_policy.dan import DAN
 from dan_policy.episode import Decode, find_device, rollout
-from dan_policy.network import DAN
+from dan_policy.registry import find, load
 from dan_policy.symmetry import SYMMETRIES, views
-from dan_policy.weights import find, load
 from mtsp_env import rules
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.instance import Instance, Tours, check_count
@@ -130,8 +129,6 @@ def solve(
         state = _set_out(instance, game, prefixes or [])
         if rules.all_visited(state)[0]:
             tours = rules.tours(state.visits[0], state.destination[0])
-        elif rows == 1 and decode == "greedy" and precision == "float32" and single.can_play(policy, device):
-            tours = single.play(policy, state, game)
         else:
             tours = _play(policy, _side_by_side(state, rows, augment, device), decode, seed)
     if polish is not None:

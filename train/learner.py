@@ -15,7 +15,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from dan_policy.episode import find_device
 from train import checkpoint
 from train.collect import costs, draw_set
-from train.config import RunConfig, check_same_run
+from train.config import RunConfig
 from train.distributed import rank, world_size
 from train.network import make_network, save_weights
 
@@ -104,7 +104,7 @@ class Learner(ABC):
             ValueError: it is damaged, or of a run with another configuration.
         """
         state = checkpoint.read(checkpoint_path(self.config))
-        check_same_run(state["config"], self.config)
+        checkpoint.check_same_run(state["config"], self.config)
         self.network.load_state_dict(state["network"])
         self.average.load_state_dict(state["average"])
         self.load_state_dict(state)

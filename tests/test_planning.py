@@ -13,7 +13,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 
 import mtsp_env
 from benchmarks.policies.nearest import nearest
-from dan_policy import DAN, DANConfig, make_actor, rollout, single, solution, solve
+from dan_policy import DAN, DANConfig, make_actor, rollout, solution, solve
 from mtsp_env import Instance, check_tours, makespan, mtsp_v0, uniform
 from mtsp_env.batched import BatchedMTSP
 
@@ -327,15 +327,13 @@ def test_a_sharper_clip_is_for_samples_alone(network, monkeypatch, decode, clip)
         return forward(self, *args)
 
     monkeypatch.setattr(DAN, "forward", watched)
-    monkeypatch.setattr(single, "can_play", lambda *_: False)
     solve(uniform(np.random.default_rng(0), 60, 3), network, decode, samples=2)
     assert set(clips) == {clip}
     assert network.config.tanh_clip == 10.0  # the given network stays as it is
 
 
 @pytest.mark.parametrize(("n_nodes", "told", "seen"), [(399, None, 398), (420, None, 100), (60, 7, 7), (60, 90, 59)])
-@pytest.mark.parametrize("alone", [True, False])
-def test_large_instances_are_seen_in_part(monkeypatch, n_nodes, told, seen, alone):
+def test_large_instances_are_seen_in_part(monkeypatch, n_nodes, told, seen):
     """From n = 400 on the nearest 100 cities, or as many as one is told; each decision's observation is cut alike."""
     longest = []
 
@@ -343,16 +341,8 @@ def test_large_instances_are_seen_in_part(monkeypatch, n_nodes, told, seen, alon
         longest.append(cities.shape[1] - 1)
         return logits(self, cities, *args, **kwargs)
 
-    def watched_alone(*args):
-        kept = in_view(*args)
-        longest.append(len(kept) - 1)
-        return kept
-
-    logits, in_view = DAN._logits, single._in_view
+    logits = DAN._logits
     monkeypatch.setattr(DAN, "_logits", watched)
-    monkeypatch.setattr(single, "_in_view", watched_alone)
-    if not alone:
-        monkeypatch.setattr(single, "can_play", lambda *_: False)
     torch.manual_seed(0)
     network = DAN(DANConfig(embed_dim=16, feedforward_dim=16, n_heads=2, prune_visited=True))
     instance = uniform(np.random.default_rng(0), n_nodes, 3)

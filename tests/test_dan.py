@@ -5,8 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dan_policy import network as module
-from dan_policy.network import DAN, AttentionLayer, DANConfig
+from dan_policy import layers
+from dan_policy.dan import DAN, DANConfig
+from dan_policy.layers import AttentionLayer
 
 SMALL = DANConfig(embed_dim=16, feedforward_dim=32, n_heads=2, city_layers=2)
 CONFIGS = {
@@ -112,7 +113,7 @@ def test_the_glimpse_ignores_visited_cities_and_pruning_forgets_them():
 
 def test_bfloat16_pads_to_a_few_lengths():
     """A kernel is built for each shape: lengths are few, no shorter than asked for and at most 12.5 % longer."""
-    rounded = {length: module._round_up(length) for length in range(1, 1025)}
+    rounded = {length: layers.padded_length(length) for length in range(1, 1025)}
     assert all(length <= longer for length, longer in rounded.items())
     assert all(longer - length < max(8, length / 8) for length, longer in rounded.items())
     assert len(set(rounded.values())) == 40
@@ -132,7 +133,7 @@ def test_what_bfloat16_pads_with_is_not_seen(monkeypatch):
     exact = open_logits(network, cities, agents, visited)
     with torch.autocast("cpu", torch.bfloat16):
         padded = open_logits(network, cities, agents, visited)
-        monkeypatch.setattr(module, "_round_up", lambda length: length)
+        monkeypatch.setattr(layers, "padded_length", lambda length: length)
         unpadded = open_logits(network, cities, agents, visited)
     assert lengths == [10, 16, 10]
     assert torch.allclose(padded, unpadded, atol=0.02)
