@@ -42,14 +42,13 @@ class ImitationLearner(Learner):
         batches = self.buffer.draw(config.sets_per_step)
         waited = time.perf_counter() - start
         self.optimiser.zero_grad()
-        loss, agreed = 0.0, 0
+        loss = agreed = torch.zeros((), device=config.device)  # kept there, so that a GPU is not waited for
         for decisions in batches:  # each counts the same: one of 16 games at n = 200 as much as one of 256 at n = 20
             with autocast(config):
                 part = imitation_loss(self.network, decisions)
                 mean = part.loss / len(batches)
             mean.backward()
-            loss += mean.detach()
-            agreed = agreed + part.agreed
+            loss, agreed = loss + mean.detach(), agreed + part.agreed
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.max_grad_norm)
         self.optimiser.step()
         self.schedule.step()
@@ -62,7 +61,7 @@ class ImitationLearner(Learner):
             "loss": float(loss),
             "agreement": float(agreed) / count,
             "grad_norm": float(norm),
-            "learning_rate": self.schedule.get_last_lr()[0],
+            "learning_rate": float(self.schedule.get_last_lr()[0]),
             "decisions_per_second": count / (time.perf_counter() - start),
             "seconds_waited": waited,
         }
