@@ -22,7 +22,7 @@ from benchmarks.run import describe_machine
 from benchmarks.suite import SEED, Cell
 from dan_policy import DANConfig, make_actor
 from dan_policy.episode import Decode, rollout
-from dan_policy.solution import SPEED
+from dan_policy.planning import SPEED
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.tours import makespan
 from train.config import ImitateConfig
@@ -156,7 +156,7 @@ def gaps(network: nn.Module, cell: Cell, decode: Decode) -> list[float]:
     for i, instance in enumerate(instances):
         nodes = torch.as_tensor(instance.nodes.copy()).expand(rows, -1, -1)
         cost = float(env.makespan(rollout(actor, env, decode, nodes).last).min())
-        found.append(cost / makespan(instance.nodes, known[i]) - 1)
+        found.append(cost / makespan(instance, known[i]) - 1)
     return found
 
 
