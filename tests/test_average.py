@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dan_policy import DAN, DANConfig, load, save
-from dan_policy.weights import load_extra
+from dan_policy.registry import load_extra
 from train.__main__ import main
 from train.presets import REFINE
 from train.reinforce import reinforce

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dan_policy.network import DAN
-from dan_policy.weights import load, load_extra, save
+from dan_policy.dan import DAN
+from dan_policy.registry import load, load_extra, save
 from train.collect import costs, draw_set
 from train.config import RunConfig
 from train.learner import VALIDATION_SEED

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-from dan_policy.network import DANConfig
+from dan_policy.dan import DANConfig
 from mtsp_env.checks import check_count
 from mtsp_env.distributions import check_distribution
 

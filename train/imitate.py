@@ -17,7 +17,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from dan_policy.actor import make_actor
-from dan_policy.weights import find
+from dan_policy.registry import find
 from train.collect import autocast
 from train.config import ImitateConfig
 from train.demonstrations import Demonstrations, demonstrate, replay

@@ -21,9 +21,9 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.record import CSVLogger, TensorboardLogger
 from tqdm import tqdm
 
+from dan_policy.dan import DAN
 from dan_policy.episode import find_device
-from dan_policy.network import DAN
-from dan_policy.weights import load, save
+from dan_policy.registry import load, save
 from train import checkpoint
 from train.collect import costs, draw_set
 from train.config import RunConfig, check_same_run

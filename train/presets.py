@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from dan_policy.network import DANConfig
+from dan_policy.dan import DANConfig
 from train.config import ReinforceConfig
 
 PAPER = ReinforceConfig(curriculum=((80_000, 20, 200, 5, 10),))
