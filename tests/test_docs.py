@@ -10,6 +10,7 @@ import shlex
 import subprocess
 import sys
 from contextlib import redirect_stderr, redirect_stdout
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -147,6 +148,9 @@ def test_make_targets_exist(page: Path) -> None:
 def test_commands_and_options_exist(page: Path) -> None:
     for words in command_lines(page):
         program, options = program_and_options(words)
+        if program[0] == "-m" and "." in program[1]:  # a module that runs at once, without a command line of its own
+            assert find_spec(program[1]), shlex.join(words)
+            continue
         unknown = [option for option in options if option not in help_of(program)]
         assert not unknown, f"{shlex.join(words)}: the help does not name {unknown}"
 
