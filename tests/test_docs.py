@@ -19,7 +19,6 @@ from dan_policy.cli import main
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
 FENCE = re.compile(r"^```(\S+) ?(\S*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)  # language, note, code
-MTSP = [sys.executable, "-c", "import sys; from dan_policy.cli import main; sys.exit(main())"]
 
 
 def fences(page: Path, language: str) -> list[tuple[str, str]]:
