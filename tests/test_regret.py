@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 import pytest
-from games import over, play, random_action
+from helpers.games import over, play, random_action
 
 import mtsp_env
 from mtsp_env import Instance, lower_bound, mtsp_v0, uniform
