@@ -6,9 +6,9 @@ import time
 
 import numpy as np
 import pytest
+from helpers.odd import ODD
 from hypothesis import given
 from hypothesis import strategies as st
-from odd import ODD
 
 from benchmarks.solvers import _optima, ea
 from benchmarks.suite import Cell

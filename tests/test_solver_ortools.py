@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("ortools.constraint_solver.pywrapcp")
 
-from odd import ODD
+from helpers.odd import ODD
 
 from benchmarks.solvers import NoTours, Unavailable, _optima, ortools
 from benchmarks.suite import Cell

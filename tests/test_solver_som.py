@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("numba")
 
-from odd import ODD
+from helpers.odd import ODD
 
 from benchmarks.solvers import som
 from benchmarks.suite import Cell
