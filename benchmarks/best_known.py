@@ -1,6 +1,7 @@
-"""Best known tours of the test sets: kept in the repository, verified by the judge, only ever improved.
+"""Best known tours of the test sets: kept in the repository, checked by the judge, and only ever improved.
 
-One file for each (set, size, seed): a list of one instance's tours a line, null where none are known.
+There is one file for each (test set, size, seed): a JSON list with the tours of one instance on each line, or null if
+none are known.
 """
 
 from __future__ import annotations
@@ -15,35 +16,36 @@ from pathlib import Path
 
 from rich.progress import track
 
-from benchmarks.files import replace_text
-from benchmarks.rows import Row
-from benchmarks.suite import TABLES, AnyCell, Cell, TsplibCell, find_cell
+from benchmarks import suite
+from benchmarks.files import write_text
+from benchmarks.harness import rows
+from benchmarks.harness.rows import Row
+from benchmarks.suite import AnyCell, Cell, TsplibCell
 from mtsp_env.instance import Instance, Tours
 from mtsp_env.tours import check_tours, lower_bound, makespan
 
 FOLDER = Path(__file__).parent / "best"
-CLOSED = 1e-9  # a makespan within this of the lower bound cannot be improved
+TOLERANCE = 1e-9  # a makespan within this of the lower bound is optimal
 
 
 def read(cell: AnyCell, seed: int, folder: Path = FOLDER) -> dict[int, Tours]:
-    """Best known tours by the number of the instance, verified; those that the cell does not count are left out.
+    """Read the best known tours of a cell by the number of the instance, at most ``cell.count``.
 
     Raises:
-        ValueError: not such a file, or tours that do not solve their instance; the message names it.
+        ValueError: a damaged file, or tours that do not solve their instance; the message names the file.
     """
-    kept, file = _kept(cell, seed, folder), folder / cell.file(seed)
-    found = {i: tours for i, tours in enumerate(kept[: cell.count]) if tours is not None}
-    instances = cell.instances(seed) if found else []
-    for i, tours in found.items():
+    file = folder / cell.file(seed)
+    kept = {i: tours for i, tours in enumerate(_read_file(file)[: cell.count]) if tours is not None}
+    instances = cell.instances(seed) if kept else []
+    for i, tours in kept.items():
         try:
             check_tours(instances[i], tours)
         except ValueError as error:
             raise ValueError(f"{file}: instance {i}: {error}") from error
-    return found
+    return kept
 
 
-def _kept(cell: AnyCell, seed: int, folder: Path) -> list[Tours | None]:
-    file = folder / cell.file(seed)
+def _read_file(file: Path) -> list[Tours | None]:
     if not file.exists():
         return []
     try:
@@ -55,83 +57,124 @@ def _kept(cell: AnyCell, seed: int, folder: Path) -> list[Tours | None]:
     return kept
 
 
-def merge(cell: AnyCell, seed: int, found: Mapping[int, Tours], folder: Path = FOLDER) -> int:
-    """Keep what is better than the kept tours, by the number of the instance; returns how many were.
-
-    The file is replaced as a whole, or not at all.
+def merge(cell: AnyCell, seed: int, candidates: Mapping[int, Tours], folder: Path = FOLDER) -> int:
+    """Keep those of the candidates that are better than the kept tours; returns how many were.
 
     Raises:
-        ValueError: tours that do not solve their instance.
+        ValueError: a damaged file, or tours that do not solve their instance.
     """
-    cell = replace(cell, count=max([cell.count, len(_kept(cell, seed, folder)), *(i + 1 for i in found)]))
-    kept, instances, better = read(cell, seed, folder), cell.instances(seed), 0
-    for i, tours in found.items():
+    file = folder / cell.file(seed)
+    cell = replace(cell, count=max([cell.count, len(_read_file(file)), *(i + 1 for i in candidates)]))
+    kept, instances, improved = read(cell, seed, folder), cell.instances(seed), 0
+    for i, tours in candidates.items():
         check_tours(instances[i], tours)
         nodes = instances[i].nodes
         if i not in kept or makespan(nodes, tours) < makespan(nodes, kept[i]) - 1e-12:
             kept[i] = tours
-            better += 1
-    if better:
+            improved += 1
+    if improved:
         lines = ",\n".join(json.dumps(kept.get(i), separators=(",", ":")) for i in range(max(kept) + 1))
-        replace_text(folder / cell.file(seed), f"[\n{lines}\n]\n")
-    return better
+        write_text(file, f"[\n{lines}\n]\n")
+    return improved
 
 
-def merge_rows(rows: Iterable[Row], tsplib: Path | None = None, folder: Path = FOLDER) -> list[str]:
-    """Keep the better tours of results; one line for each cell that has any."""
-    found: dict[tuple[AnyCell, int], dict[int, Tours]] = defaultdict(dict)
-    for row in sorted((row for row in rows if row.ok), key=lambda row: -row.makespan):  # the best comes last
-        cell = find_cell(row.table, row.cell)
+def merge_rows(results: Iterable[Row], tsplib: Path | None = None, folder: Path = FOLDER) -> list[str]:
+    """Keep the better tours of these results; returns one line for each cell that has any."""
+    candidates: dict[tuple[AnyCell, int], dict[int, Tours]] = defaultdict(dict)
+    for row in sorted((row for row in results if row.ok), key=lambda row: -row.makespan):  # the best comes last
+        cell = suite.find_cell(row.table, row.cell)
         cell = replace(cell, folder=tsplib) if isinstance(cell, TsplibCell) else replace(cell, count=1)
-        found[cell, row.seed][row.instance] = row.tours
+        candidates[cell, row.seed][row.instance] = row.tours
     return [
-        f"{cell.label}: {merge(cell, seed, best, folder)} of {len(best)} improved"
-        for (cell, seed), best in found.items()
+        f"{cell.label}: {merge(cell, seed, tours, folder)} of {len(tours)} improved"
+        for (cell, seed), tours in candidates.items()
     ]
 
 
-def search(cell: AnyCell, seed: int, seconds: float, workers: int = 1, folder: Path = FOLDER) -> str:
-    """Give every instance ``seconds`` of the reference solver afresh, and as many from its best known tours."""
+def search_cell(cell: AnyCell, seed: int, seconds: float, workers: int = 1, folder: Path = FOLDER) -> str:
+    """Run the reference solver on every instance for ``seconds``, and again from its best known tours; keep the best.
+
+    Returns one line that says how many instances were improved.
+    """
     kept = read(cell, seed, folder)
 
-    def improved(job: tuple[int, Instance]) -> tuple[int, Tours]:
+    def improve_one(job: tuple[int, Instance]) -> tuple[int, Tours]:
         i, instance = job
-        return i, _improved(instance, kept.get(i), seconds, seed + i)
+        return i, _improve(instance, kept.get(i), seconds, seed + i)
 
-    with ThreadPoolExecutor(workers) as pool:  # the solver's kernels run outside of Python's lock
-        jobs = pool.map(improved, enumerate(cell.instances(seed)))
-        found = dict(track(jobs, total=cell.count, description=cell.label))
-    return f"{cell.label}: {merge(cell, seed, found, folder)} of {cell.count} improved"
+    with ThreadPoolExecutor(workers) as pool:  # the solver's kernels release Python's lock
+        jobs = pool.map(improve_one, enumerate(cell.instances(seed)))
+        tours = dict(track(jobs, total=cell.count, description=cell.label))
+    return f"{cell.label}: {merge(cell, seed, tours, folder)} of {cell.count} improved"
 
 
-def _improved(instance: Instance, tours: Tours | None, seconds: float, seed: int) -> Tours:
-    from mtsp_env.reference import improve  # Numba: only where it is needed
+def _improve(instance: Instance, kept: Tours | None, seconds: float, seed: int) -> Tours:
+    from mtsp_env.reference import improve  # imports Numba
 
-    if tours is not None and makespan(instance.nodes, tours) <= lower_bound(instance) + CLOSED:
-        return tours
-    found = improve(instance, seconds=seconds, seed=seed)
-    if tours is None:
-        return found
-    polished = improve(instance, tours, seconds=seconds, seed=seed)
-    return min(found, polished, key=lambda one: makespan(instance.nodes, one))
+    if kept is not None and makespan(instance.nodes, kept) <= lower_bound(instance) + TOLERANCE:
+        return kept
+    fresh = improve(instance, seconds=seconds, seed=seed)
+    if kept is None:
+        return fresh
+    improved = improve(instance, kept, seconds=seconds, seed=seed)
+    return min(fresh, improved, key=lambda tours: makespan(instance.nodes, tours))
 
 
 def kept_cells(tsplib: Path | None = None, folder: Path = FOLDER) -> list[tuple[AnyCell, int]]:
-    """Every (cell, seed) that tours are kept of; those of TSPLIB only where ``tsplib`` says where its files are."""
-    found: list[tuple[AnyCell, int]] = []
+    """Every (cell, seed) with kept tours; TSPLIB cells only if ``tsplib`` names the folder of their files."""
+    cells: list[tuple[AnyCell, int]] = []
     for file in sorted(folder.glob("*.json")):
         if size := re.fullmatch(r"uniform-(\d+)x(\d+)-seed(\d+)\.json", file.name):
             n, m, seed = map(int, size.groups())
-            found.append((Cell(n, m, len(_kept(Cell(n, m, 1), seed, folder))), seed))
+            cells.append((Cell(n, m, len(_read_file(file))), seed))
     if tsplib is not None:
-        found += [(replace(c, folder=tsplib), 0) for c in TABLES["3"] if (folder / c.file(0)).exists()]
-    return found
+        cells += [(replace(c, folder=tsplib), 0) for c in suite.TABLES["3"] if (folder / c.file(0)).exists()]
+    return cells
 
 
-def check(cell: AnyCell, seed: int, folder: Path = FOLDER) -> str:
-    """Verify the kept tours of a cell, in one line. Raises as ``read``."""
+def verify(cell: AnyCell, seed: int, folder: Path = FOLDER) -> str:
+    """Check the kept tours of a cell; returns one line about them. Raises as ``read``."""
     kept, instances = read(cell, seed, folder), cell.instances(seed)
     costs = {i: makespan(instances[i].nodes, tours) for i, tours in kept.items()}
-    proved = sum(cost <= lower_bound(instances[i]) + CLOSED for i, cost in costs.items())
+    proved = sum(cost <= lower_bound(instances[i]) + TOLERANCE for i, cost in costs.items())
     mean = f", mean {sum(costs.values()) / len(costs):.4f}" if costs else ""
     return f"{cell.label}: {len(kept)} of {cell.count} instances{mean}, {proved} at the lower bound"
+
+
+def main(
+    check: bool = False,
+    merge: tuple[Path, ...] = (),
+    search: float | None = None,
+    table: str | None = None,
+    instances: int | None = None,
+    seed: int = suite.SEED,
+    workers: int = 1,
+    tsplib: Path | None = None,
+) -> None:
+    """Maintain the best known tours: take better ones from results, search for better ones, check them, in this order.
+
+    Args:
+        check: check the kept tours.
+        merge: files of results to take better tours from.
+        search: seconds of the reference solver for each instance.
+        table: 1, 2, 3, figure4 or smoke; by default every cell with kept tours.
+        instances: number of instances in each cell of the table; by default the table's.
+        seed: seed of the table's instances.
+        workers: number of threads of the search.
+        tsplib: folder with the TSPLIB files of table 3.
+
+    Raises:
+        OSError: a file cannot be read or written.
+        ValueError: nothing to do, an unknown table, or damaged files.
+    """
+    if search is None and not check and not merge:
+        raise ValueError("choose at least one of --merge FILES, --search SECONDS and --check")
+    for file in merge:
+        print("\n".join(merge_rows(rows.read(file), tsplib)))
+    if search is None and not check:
+        return
+    cells = kept_cells(tsplib) if table is None else [(cell, seed) for cell in suite.cells(table, tsplib, instances)]
+    for cell, cell_seed in cells if search is not None else ():
+        print(search_cell(cell, cell_seed, search, workers))
+    for cell, cell_seed in cells if check else ():
+        print(verify(cell, cell_seed))

@@ -1,4 +1,4 @@
-"""Learning curves on one small size: REINFORCE from scratch beside imitation, over the same wall-clock time."""
+"""Learning curves at n = 20, m = 3: REINFORCE from scratch and imitation over the same wall-clock time."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.files import replace_text
-from benchmarks.plots import save
-from benchmarks.run import describe_machine
+from benchmarks.files import write_text
+from benchmarks.harness.machine import describe_machine
+from benchmarks.reports.plots import save
 from mtsp_env.reference import improve_batch
 from mtsp_env.tours import makespan
 from train import checkpoint
@@ -22,48 +22,53 @@ from train.learner import VALIDATION_SEED, checkpoint_path
 from train.presets import QUICK
 from train.reinforce import reinforce
 
-RESULTS = Path(__file__).parent / "results"
-SIZE = {"n_nodes": (20, 20), "n_agents": (3, 3), "nodes_per_agent": 2, "speed": 0.01, "validation_instances": 512}
+RESULTS = Path(__file__).parents[1] / "results"
+SETTING = {"n_nodes": (20, 20), "n_agents": (3, 3), "nodes_per_agent": 2, "speed": 0.01, "validation_instances": 512}
+
+Curve = list[tuple[int, float, float]]
+"""Points of a learning curve: step, seconds of training, mean validation cost."""
 
 
 def main(minutes: float = 30.0, folder: Path = Path("runs/curves"), out: Path = RESULTS) -> None:
-    """Train both that have not been trained for so long yet, one after the other on one thread; write data and picture.
+    """Train with REINFORCE from scratch and by imitation, for the same time on one thread; write data and a plot.
 
     Args:
-        minutes: of each.
-        folder: of the runs; broken-off ones are resumed.
+        minutes: training time of each.
+        folder: folder of the runs; existing runs are resumed, and only the time that is left is trained.
         out: folder for curves.csv and curves.png.
 
     Raises:
-        ValueError: ``minutes`` not above 0.
+        ValueError: ``minutes`` is not above 0.
     """
     if not minutes > 0:
         raise ValueError(f"minutes must be above 0, got {minutes!r}")
-    common = SIZE | {"threads": 1, "tensorboard": False, "network": QUICK.network, "steps": 10**9}
+    common = SETTING | {"threads": 1, "tensorboard": False, "network": QUICK.network, "steps": 10**9}
     runs = {
         "REINFORCE from scratch": (reinforce, replace(QUICK, out=folder / "reinforce", validate_every=10, **common)),
         "imitation": (imitate, ImitateConfig(out=folder / "imitate", workers=0, validate_every=50, **common)),
     }
     curves = {}
     for name, (train, config) in runs.items():
-        begun = config.out.exists()
-        left = 60 * minutes - (checkpoint.read(checkpoint_path(config))["progress"]["seconds"] if begun else 0.0)
+        exists = config.out.exists()
+        left = 60 * minutes - (checkpoint.read(checkpoint_path(config))["progress"]["seconds"] if exists else 0.0)
         if left > 0:
-            train(replace(config, seconds=left, resume=begun))
+            train(replace(config, seconds=left, resume=exists))
         curves[name] = read(config.out)
-    teacher = best_cost(next(iter(runs.values()))[1])
+    reference = reference_cost(next(iter(runs.values()))[1])
     lines = ["method,step,seconds,validation_cost"]
-    lines += [f"{name},{step},{second:.1f},{cost:.5f}" for name, rows in curves.items() for step, second, cost in rows]
-    lines.append(f"reference solver,,,{teacher:.5f}")
-    replace_text(out / "curves.csv", "\n".join(lines) + "\n")
-    draw(curves, teacher, out / "curves.png")
-    for name, rows in curves.items():
-        print(f"{name}: {rows[0][2]:.3f} -> {rows[-1][2]:.3f} after {rows[-1][1] / 60:.1f} minutes")
-    print(f"reference solver: {teacher:.3f}\n{out / 'curves.png'}")
+    lines += [
+        f"{name},{step},{second:.1f},{cost:.5f}" for name, curve in curves.items() for step, second, cost in curve
+    ]
+    lines.append(f"reference solver,,,{reference:.5f}")
+    write_text(out / "curves.csv", "\n".join(lines) + "\n")
+    draw(curves, reference, out / "curves.png")
+    for name, curve in curves.items():
+        print(f"{name}: {curve[0][2]:.3f} -> {curve[-1][2]:.3f} after {curve[-1][1] / 60:.1f} minutes")
+    print(f"reference solver: {reference:.3f}\n{out / 'curves.png'}")
 
 
-def read(folder: Path) -> list[tuple[int, float, float]]:
-    """Step, seconds of training and validation cost, from a run's logs."""
+def read(folder: Path) -> Curve:
+    """Read the learning curve of a run from its logs."""
 
     def scalars(name: str) -> dict[int, float]:
         (file,) = folder.glob(f"logs/**/{name}.csv")
@@ -74,23 +79,23 @@ def read(folder: Path) -> list[tuple[int, float, float]]:
     return [(step, seconds[step], cost) for step, cost in scalars("validation_cost").items()]
 
 
-def best_cost(config: RunConfig) -> float:
-    """Mean makespan of the reference solver's tours on the instances that runs are validated on."""
-    found = []
+def reference_cost(config: RunConfig) -> float:
+    """Mean makespan of the reference solver on the instances that runs are validated on."""
+    costs = []
     for part in draw_set(np.random.default_rng(VALIDATION_SEED), config, config.validation_instances):
         nodes = part.nodes.numpy()
         tours = improve_batch(nodes, part.n_agents, iterations=500 * nodes.shape[1], seed=0)
-        found += [makespan(*one) for one in zip(nodes, tours, strict=True)]
-    return float(np.mean(found))
+        costs += [makespan(*one) for one in zip(nodes, tours, strict=True)]
+    return float(np.mean(costs))
 
 
-def draw(curves: dict[str, list[tuple[int, float, float]]], teacher: float, path: Path) -> None:
-    """Mean greedy cost on the validation set against minutes."""
+def draw(curves: dict[str, Curve], reference: float, path: Path) -> None:
+    """Plot the mean greedy cost on the validation set against minutes."""
     figure = Figure(figsize=(6.4, 4.0), layout="constrained")
     ax = figure.subplots()
-    for (name, rows), colour in zip(curves.items(), ("#d73027", "#4575b4"), strict=True):
-        ax.plot([second / 60 for _, second, _ in rows], [cost for *_, cost in rows], color=colour, label=name)
-    ax.axhline(teacher, color="black", lw=1, ls="--", label="reference solver")
+    for (name, curve), colour in zip(curves.items(), ("#d73027", "#4575b4"), strict=True):
+        ax.plot([second / 60 for _, second, _ in curve], [cost for *_, cost in curve], color=colour, label=name)
+    ax.axhline(reference, color="black", lw=1, ls="--", label="reference solver")
     machine = describe_machine()["processor"]
     ax.set(xlabel=f"minutes on one thread ({machine})", ylabel="mean makespan, greedy, 512 instances")
     ax.set_title("n = 20, m = 3", fontsize=10)

@@ -1,6 +1,6 @@
-"""Why there is a reference solver: what well-kept routing libraries find in the same time, on one thread.
+"""Why there is a reference solver: the gaps of well-kept routing libraries after the same time, on one thread.
 
-``python -m benchmarks.libraries``, with ``pyvrp`` (0.14) and ``ortools`` (9.15) installed.
+It needs ``pyvrp`` (0.14) and ``ortools`` (9.15).
 """
 
 from __future__ import annotations
@@ -8,47 +8,48 @@ from __future__ import annotations
 import time
 
 import numpy as np
-import tyro
 from scipy.stats import sem
 
 from benchmarks import solvers
+from benchmarks.reports.markdown import markdown_table
 from benchmarks.suite import SEED, Cell
 from mtsp_env.instance import Instance, Tours
-from mtsp_env.reference import improve
 from mtsp_env.tours import check_tours, lower_bound, makespan
 
-UNIT = 1_000_000  # PyVRP counts in whole numbers
-SHARE = 0.1  # of the time, for one limit at most
-FINE = 1e-3  # limits as near as this to the best makespan have had their turn: the lower ones are tried again
+UNIT = 1_000_000  # PyVRP's distances are whole numbers
+SHARE = 0.1  # of the time, at most, for each limit
+RESOLUTION = 1e-3  # if the bisection's interval is smaller, relative to the best makespan, lower limits are tried again
 
 
 def pyvrp(instance: Instance, seconds: float, seed: int) -> Tours:
-    """PyVRP minimises the total length, so: bisection on the longest distance that a vehicle may go.
+    """Tours by PyVRP, which minimises the total length, with a bisection on a vehicle's maximum distance.
 
-    The limit is between the lower bound and the best makespan so far, at first greedy insertion's. Each starts from the
-    best tours so far, and is over with the first feasible ones or its share of the time.
+    The limit lies between the lower bound and the best makespan so far, which begins with greedy insertion. Each solve
+    starts from the best tours so far and ends with the first feasible solution or after its share of the time.
     """
-    import pyvrp as lib
+    import pyvrp as library
     from pyvrp.stop import FirstFeasible, MaxRuntime, MultipleCriteria
+
+    from mtsp_env.reference import improve  # imports Numba
 
     end, m, nodes = time.perf_counter() + seconds, instance.n_agents, instance.nodes
     legs = [np.ceil(np.linalg.norm(nodes[:, None] - nodes, axis=2) * UNIT).astype(np.int64)]
-    places = [lib.Location(x, y) for x, y in nodes * UNIT]
-    clients = [lib.Client(i) for i in range(1, len(nodes))]
+    places = [library.Location(x, y) for x, y in nodes * UNIT]
+    clients = [library.Client(i) for i in range(1, len(nodes))]
 
     best = improve(instance, iterations=0)
     low, high = (bound := lower_bound(instance)), makespan(nodes, best)
     while (left := end - time.perf_counter()) > 0 and high > bound + 1e-6:
-        if high - low < FINE * high:
+        if high - low < RESOLUTION * high:
             low = bound
         limit = (low + high) / 2
-        vehicles = lib.VehicleType(m, max_distance=int(limit * UNIT))
-        data = lib.ProblemData(places, clients, [lib.Depot(0)], [vehicles], legs, legs)
-        start = lib.Solution(data, [[city - 1 for city in tour[1:-1]] for tour in best if len(tour) > 2])
+        vehicles = library.VehicleType(m, max_distance=int(limit * UNIT))
+        data = library.ProblemData(places, clients, [library.Depot(0)], [vehicles], legs, legs)
+        start = library.Solution(data, [[city - 1 for city in tour[1:-1]] for tour in best if len(tour) > 2])
         stop = MultipleCriteria([FirstFeasible(), MaxRuntime(min(left, SHARE * seconds))])
-        found = lib.solve(data, stop, seed, collect_stats=False, initial_solution=start).best
-        if found.is_feasible():
-            best = [[0, *(visit.idx + 1 for visit in tour if visit.is_client()), 0] for tour in found.routes()]
+        solution = library.solve(data, stop, seed, collect_stats=False, initial_solution=start).best
+        if solution.is_feasible():
+            best = [[0, *(visit.idx + 1 for visit in tour if visit.is_client()), 0] for tour in solution.routes()]
             high = makespan(nodes, best)
         else:
             low = limit
@@ -56,15 +57,24 @@ def pyvrp(instance: Instance, seconds: float, seed: int) -> Tours:
 
 
 def main(instances: int = 5, seconds: tuple[float, ...] = (0.1, 1.0, 5.0), seed: int = SEED) -> None:
-    """Mean gap of each solver to the best of all of them, ± standard error, in a Markdown table."""
+    """Print the mean gap of the reference solver, PyVRP and OR-Tools to the best of the three, in a Markdown table.
+
+    Args:
+        instances: number of instances of each size, at least 2.
+        seconds: budgets of the solvers.
+        seed: seed of the instances.
+    """
     methods = {"reference": solvers.find("reference"), "PyVRP": pyvrp, "OR-Tools": solvers.find("ortools-gls")}
-    print("| gap to the best of the row, % | " + " | ".join(methods) + " |\n|---|" + "---|" * len(methods))
+    lines = []
     for n, m in ((50, 5), (100, 5), (200, 10)):
+        problems = Cell(n, m, instances).instances(seed)
         for budget in seconds:
-            problems = enumerate(Cell(n, m, instances).instances(seed))
-            costs = np.array([[_cost(f, x, budget, seed + i) for f in methods.values()] for i, x in problems])
+            costs = np.array(
+                [[_cost(solve, x, budget, seed + i) for solve in methods.values()] for i, x in enumerate(problems)]
+            )
             gaps = 100 * (costs / np.nanmin(costs, axis=1, keepdims=True) - 1.0)
-            print(f"| {n}, {m} in {budget:g} s", *(f"{g.mean():.2f} ± {sem(g):.2f}" for g in gaps.T), "", sep=" | ")
+            lines.append([f"{n}, {m} in {budget:g} s", *(f"{gap.mean():.2f} ± {sem(gap):.2f}" for gap in gaps.T)])
+    print(markdown_table(["gap to the best of the line, %", *methods], lines))
 
 
 def _cost(solve: solvers.Solve, instance: Instance, seconds: float, seed: int) -> float:
@@ -74,7 +84,3 @@ def _cost(solve: solvers.Solve, instance: Instance, seconds: float, seed: int) -
         return np.nan
     check_tours(instance, tours)
     return makespan(instance.nodes, tours)
-
-
-if __name__ == "__main__":
-    tyro.cli(main)
