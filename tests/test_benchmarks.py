@@ -240,7 +240,7 @@ def test_peers_are_measured_in_turns_and_compared(monkeypatch, tmp_path):
     table = speed_peers.speed_table(0.0, 2, Path(sys.executable), compiled=False)
     assert calls == [2, 3, 2, 3] and torch.get_num_threads() == threads
     columns = [list(column.cells) for column in table.columns]
-    assert columns[0] == ["RL4CO MTSPEnv", "BatchedMTSP, eager"] * 2 and columns[1] == ["2", "2", "3", "3"]
+    assert columns[0] == ["RL4CO MTSPEnv", "BatchedMTSP"] * 2 and columns[1] == ["2", "2", "3", "3"]
     assert columns[2][::2] == ["100000.000"] * 2 and columns[4] == ["1.00", "0.00"] * 2
     assert all(float(ratio) > 10 for ratio in columns[8][1::2])
 

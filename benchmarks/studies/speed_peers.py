@@ -26,7 +26,7 @@ FOLDER = Path(__file__).parents[1] / "peers"
 PYTHON = FOLDER / ".venv" / "bin" / "python"
 N_NODES, N_AGENTS = 50, 5
 BATCHES = (64, 1024)
-RL4CO = "RL4CO MTSPEnv"
+RL4CO, EAGER, COMPILED = "RL4CO MTSPEnv", "BatchedMTSP", "BatchedMTSP, compiled"
 
 
 @dataclass
@@ -72,19 +72,9 @@ def speed_table(seconds: float, repeats: int, python: Path = PYTHON, compiled: b
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        environments = {
-            (name, batch): BatchedMTSP(
-                N_NODES,
-                N_AGENTS,
-                [batch],
-                depot="final",
-                seed=0,
-                check_actions=False,
-                compile=name.endswith("compiled"),
-            )
-            for name in ["BatchedMTSP, eager", *(["BatchedMTSP, compiled"] if compiled else [])]
-            for batch in BATCHES
-        }
+        environments = {(EAGER, batch): _environment(batch) for batch in BATCHES}
+        if compiled:
+            environments |= {(COMPILED, batch): _environment(batch).compile() for batch in BATCHES}
         for key, env in environments.items():
             timings[key] = Timings()
             measure(env, seconds=0.0)  # warms up and compiles
@@ -101,8 +91,12 @@ def speed_table(seconds: float, repeats: int, python: Path = PYTHON, compiled: b
     return _table(timings, versions, title)
 
 
+def _environment(batch: int) -> BatchedMTSP:
+    return BatchedMTSP(N_NODES, N_AGENTS, [batch], depot="final", seed=0, check_actions=False)
+
+
 def measure(env: BatchedMTSP, seconds: float) -> Timings:
-    """Play episodes for ``seconds``, at least one of each kind."""
+    """Play pairs of episodes for ``seconds``, at least one pair: one for ``env``, one for ``loop``."""
     timings, start = Timings(), time.perf_counter()
     while not timings.env or time.perf_counter() - start < seconds:
         timings.env.append(env_seconds(env))
@@ -166,13 +160,13 @@ def _table(timings: dict[tuple[str, int], Timings], versions: dict[str, str], ti
     table = Table(
         "environment",
         "B",
-        "env.step, ms: best",
-        "median",
-        "to RL4CO's: best",
-        "median",
-        "loop, ms: best",
-        "decisions/s: best",
-        "to RL4CO's",
+        "env.step, best ms",
+        "median ms",
+        "best / RL4CO's",
+        "median / RL4CO's",
+        "whole loop, best ms",
+        "decisions/s, best",
+        "/ RL4CO's",
         title=f"n={N_NODES}, m={N_AGENTS}, whole random episodes; {title}; {peer}",
     )
     for batch in BATCHES:
