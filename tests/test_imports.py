@@ -28,6 +28,7 @@ FORBIDDEN = {
     "mtsp_env/render.py": [*FACES, "mtsp_env.reference"],
     "dan_policy/network.py": ["mtsp_env*"],
     "dan_policy/actor.py": ["mtsp_env*"],
+    "benchmarks/peers/rl4co_speed.py": ["mtsp_env*", "dan_policy*", "train*", "benchmarks*"],
 }
 NEEDS_AN_EXTRA = {"torch", "tensordict", "torchrl", "numba", "matplotlib", "vrplib"}
 LIGHT = ["__init__", "instance", "tours", "tsplib", "rules", "mtsp_v0", "version"]
