@@ -68,8 +68,8 @@ def merge(cell: AnyCell, seed: int, candidates: Mapping[int, Tours], folder: Pat
     kept, instances, improved = read(cell, seed, folder), cell.instances(seed), 0
     for i, tours in candidates.items():
         check_tours(instances[i], tours)
-        nodes = instances[i].nodes
-        if i not in kept or makespan(nodes, tours) < makespan(nodes, kept[i]) - 1e-12:
+        instance = instances[i]
+        if i not in kept or makespan(instance, tours) < makespan(instance, kept[i]) - 1e-12:
             kept[i] = tours
             improved += 1
     if improved:
@@ -111,13 +111,13 @@ def search_cell(cell: AnyCell, seed: int, seconds: float, workers: int = 1, fold
 def _improve(instance: Instance, kept: Tours | None, seconds: float, seed: int) -> Tours:
     from mtsp_env.reference import improve  # imports Numba
 
-    if kept is not None and makespan(instance.nodes, kept) <= lower_bound(instance) + TOLERANCE:
+    if kept is not None and makespan(instance, kept) <= lower_bound(instance) + TOLERANCE:
         return kept
     fresh = improve(instance, seconds=seconds, seed=seed)
     if kept is None:
         return fresh
     improved = improve(instance, kept, seconds=seconds, seed=seed)
-    return min(fresh, improved, key=lambda tours: makespan(instance.nodes, tours))
+    return min(fresh, improved, key=lambda tours: makespan(instance, tours))
 
 
 def kept_cells(tsplib: Path | None = None, folder: Path = FOLDER) -> list[tuple[AnyCell, int]]:
@@ -135,7 +135,7 @@ def kept_cells(tsplib: Path | None = None, folder: Path = FOLDER) -> list[tuple[
 def verify(cell: AnyCell, seed: int, folder: Path = FOLDER) -> str:
     """Check the kept tours of a cell; returns one line about them. Raises as ``read``."""
     kept, instances = read(cell, seed, folder), cell.instances(seed)
-    costs = {i: makespan(instances[i].nodes, tours) for i, tours in kept.items()}
+    costs = {i: makespan(instances[i], tours) for i, tours in kept.items()}
     proved = sum(cost <= lower_bound(instances[i]) + TOLERANCE for i, cost in costs.items())
     mean = f", mean {sum(costs.values()) / len(costs):.4f}" if costs else ""
     return f"{cell.label}: {len(kept)} of {cell.count} instances{mean}, {proved} at the lower bound"

@@ -15,7 +15,9 @@ from typing import NamedTuple, NoReturn
 
 import numpy as np
 
-from mtsp_env.instance import DISTRIBUTIONS, Instance, Tours, read_instance, sample_nodes, write_instance, write_tours
+from mtsp_env.distributions import DISTRIBUTIONS, sample
+from mtsp_env.files import read_instance, write_instance, write_tours
+from mtsp_env.instance import Instance, Tours
 from mtsp_env.render import check_suffix, save_picture
 from mtsp_env.tours import lower_bound, tour_lengths
 from mtsp_env.tsplib import read_tsplib
@@ -173,7 +175,7 @@ def _check_outputs(files: Sequence[str], plots: Sequence[Path | None], outs: Seq
 
 def _record(instance: Instance, plan: Plan) -> dict:
     """What there is to say about a plan, in the file's units; measured by the judge, not by the solver."""
-    lengths = tour_lengths(instance.nodes, plan.tours) * instance.scale
+    lengths = tour_lengths(instance, plan.tours) * instance.scale
     return {
         "name": instance.name,
         "n_nodes": instance.n_nodes,
@@ -194,8 +196,8 @@ def _generate(args: argparse.Namespace) -> None:
     path = Path(args.out)
     if path.suffix.lower() != ".json":
         raise ValueError(f"{path}: unknown suffix {path.suffix!r}; choose from ['.json']")
-    nodes = sample_nodes(args.distribution, np.random.default_rng(args.seed), 1, args.nodes)[0]
-    instance = Instance(nodes, args.agents, f"{args.distribution}-{args.nodes}-{args.seed}")
+    problem = sample(args.distribution, np.random.default_rng(args.seed), 1, args.nodes, args.agents)
+    instance = problem.instance(0, f"{args.distribution}-{args.nodes}-{args.seed}")
     with _writing(path):
         write_instance(path, instance)
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
-from mtsp_env.instance import check_count
+from mtsp_env.checks import check_count
 
 Decode = Literal["greedy", "sample"]
 EXPLORATION = {"greedy": ExplorationType.DETERMINISTIC, "sample": ExplorationType.RANDOM}
@@ -65,7 +65,7 @@ def rollout(
     if decode not in EXPLORATION:
         raise ValueError(f"unknown decode {decode!r}; choose from {sorted(EXPLORATION)}")
     if isinstance(nodes, Tensor):
-        nodes = TensorDict({"nodes": nodes}, batch_size=env.batch_size, device=env.device)
+        nodes = TensorDict({"game": {"nodes": nodes}}, batch_size=env.batch_size, device=env.device)
     td = env.reset() if nodes is None else env.reset(nodes, set_state=True)
     kept, valid = [], []
     reward = torch.zeros(env.batch_size, device=env.device)

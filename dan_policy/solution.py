@@ -23,7 +23,8 @@ from dan_policy.symmetry import SYMMETRIES, views
 from dan_policy.weights import find, load
 from mtsp_env import rules
 from mtsp_env.batched import BatchedMTSP
-from mtsp_env.instance import Instance, Tours, check_count
+from mtsp_env.checks import check_count, check_seconds
+from mtsp_env.instance import Instance, Tours, batch
 from mtsp_env.tours import check_prefixes, check_tours, makespan
 
 Precision = Literal["auto", "float32", "bfloat16"]
@@ -142,7 +143,7 @@ def solve(
     method = f"dan({'g.' if decode == 'greedy' else f's.{samples}'}{'x8' if augment else ''})"
     if polish is not None:
         method += f"+improve({improve:g} s)"
-    return Solution(tours, makespan(instance.nodes, tours), seconds, method)
+    return Solution(tours, makespan(instance, tours), seconds, method)
 
 
 @cache
@@ -158,7 +159,7 @@ def _polish(seconds: float, seed: int, prefixes: Tours | None) -> Callable[[Inst
     """The reference solver for so many seconds, ready to start."""
     from mtsp_env import reference  # Numba: only where it is needed
 
-    reference.check_seconds("improve", seconds)
+    check_seconds("improve", seconds)
     check_count("seed", seed, minimum=0)
     reference.compile_kernels()
     return partial(reference.improve, seconds=seconds, seed=seed, prefixes=prefixes)
@@ -166,25 +167,28 @@ def _polish(seconds: float, seed: int, prefixes: Tours | None) -> Callable[[Inst
 
 def _set_out(instance: Instance, game: rules.Rules, prefixes: Tours) -> rules.State:
     """The moment (one row of NumPy arrays) when all ``prefixes`` are driven, by the game's own rules and clock."""
-    state, left = rules.start(instance.nodes[None], instance.n_agents), [prefix[1:] for prefix in prefixes]
+    state, left = rules.start(batch([instance])), [prefix[1:] for prefix in prefixes]
     while any(left):
         agent = min((a for a in range(len(left)) if left[a]), key=lambda a: (state.ready[0, a], a))
         action, *left[agent] = left[agent]
-        state = rules.depart(state._replace(agent=np.array([agent])), game, np.array([action]))
-    return state._replace(agent=rules.agent_to_decide(state.ready))
+        state = rules.depart(state, game, np.array([action]), np.array([agent]))
+    return state
 
 
 def _side_by_side(state: rules.State, rows: int, augment: bool, device: torch.device) -> TensorDict:
     """The same state in so many rows, as the batched environment takes it; in the square's symmetries in turn."""
-    parts = {name: torch.tensor(part, device=device) for name, part in state._asdict().items()}
-    many = TensorDict(parts, batch_size=[1], device=device).expand(rows).contiguous()
-    return many.set("nodes", views(parts["nodes"][0], rows)) if augment else many
+    parts = {name: torch.tensor(part, device=device) for name, part in state.arrays().items()}
+    game = TensorDict(parts, batch_size=[1], device=device).expand(rows).contiguous()
+    if augment:
+        nodes = views(parts["nodes"][0], rows)
+        game.update({"nodes": nodes, "seen_nodes": nodes.to(torch.float32)})
+    return TensorDict({"game": game}, batch_size=[rows], device=device)
 
 
 def _play(policy: nn.Module, start: TensorDict, decode: Decode, seed: int) -> Tours:
     """The best game from ``start``, whose rows are all the same state."""
     actor = make_actor(policy) if isinstance(policy, DAN) else policy
-    (rows, n_nodes), n_agents, device = start["visited"].shape, start["ready"].shape[1], start.device
+    (rows, n_nodes), n_agents, device = start["game", "visited"].shape, start["game", "ready"].shape[1], start.device
     env = BatchedMTSP(n_nodes, n_agents, [rows], SPEED, depot="final", device=device, check_actions=False)
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
         torch.manual_seed(seed)

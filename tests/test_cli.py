@@ -37,7 +37,7 @@ class FakeSolve:
         self.calls.append(options)
         cities, m = list(range(1, instance.n_nodes)), instance.n_agents
         tours = [[0, *cities[agent::m], 0] for agent in range(m)]
-        return SimpleNamespace(tours=tours, makespan=makespan(instance.nodes, tours), seconds=0.25, method="fake")
+        return SimpleNamespace(tours=tours, makespan=makespan(instance, tours), seconds=0.25, method="fake")
 
 
 @pytest.fixture

@@ -66,7 +66,7 @@ def test_solves_with_a_policy_from_a_file(folder, capsys) -> None:
         assert main(argv) == 0
         found = json.loads(capsys.readouterr().out)
         check_tours(instance, found["tours"])
-        assert found["makespan"] == pytest.approx(makespan(instance.nodes, found["tours"]) * instance.scale)
+        assert found["makespan"] == pytest.approx(makespan(instance, found["tours"]) * instance.scale)
         assert found["lower_bound"] == lower_bound(instance) * instance.scale <= found["makespan"]
 
 

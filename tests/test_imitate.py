@@ -62,7 +62,7 @@ def test_canonical_tours_solve_the_same_instance_no_worse_in_one_order_whatever_
     instance, tours = case
     found = canonical(instance.nodes, tours)
     check_tours(instance, found)
-    assert makespan(instance.nodes, found) <= makespan(instance.nodes, tours) + 1e-12
+    assert makespan(instance, found) <= makespan(instance, tours) + 1e-12
     assert all(len(tour) > 2 for tour in found)  # nobody stays at home
     turned = [tour[::-1] for tour in tours[::-1]]
     if all(len(tour) > 2 for tour in tours):
@@ -81,7 +81,7 @@ def test_canonical_tours_begin_as_they_began(case, data):
                 for tour, prefix, home in zip(tours, prefixes, closed, strict=True)]  # fmt: skip
     found = canonical(instance.nodes, tours, prefixes)
     check_tours(instance, found)
-    assert makespan(instance.nodes, found) <= makespan(instance.nodes, tours) + 1e-12
+    assert makespan(instance, found) <= makespan(instance, tours) + 1e-12
     assert all(tour[: len(prefix)] == prefix for tour, prefix in zip(found, prefixes, strict=True))
     waiting = [tour for tour, prefix in zip(found, prefixes, strict=True) if prefix == [0]]
     if [0, 0] in waiting:
@@ -109,7 +109,7 @@ def test_the_teachers_policy_plays_its_tours(case):
     env = environment(instance.n_nodes, instance.n_agents, 1, TINY)
     episode = rollout(follow(shown), env, "greedy", torch.tensor(shown.nodes))
     assert env.tours() == [tours]
-    assert -float(episode.reward) == pytest.approx(makespan(instance.nodes, tours))
+    assert -float(episode.reward) == pytest.approx(makespan(instance, tours))
 
 
 def test_a_replayed_set_holds_every_decision_of_the_teachers_tours():

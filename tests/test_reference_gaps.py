@@ -73,7 +73,7 @@ def test_gaps_are_to_the_best_known_tours(monkeypatch, places) -> None:
     best_known.merge(cell, 7, {0: known, 1: known}, places["folder"])
     monkeypatch.setattr(reference_gaps, "improve", Fake())
     outcome = reference_gaps.measure(TINY[0], cell, 7, places["out"], places["folder"])
-    gaps = [makespan(x.nodes, BAD) / makespan(x.nodes, known) - 1.0 for x in instances[:2]]
+    gaps = [makespan(x, BAD) / makespan(x, known) - 1.0 for x in instances[:2]]
     assert outcome.gap == pytest.approx([*gaps, 0.0])
     assert best_known.read(cell, 7, places["folder"]) == {0: known, 1: known, 2: BAD}  # measured tours are kept too
     assert outcome.long_run.tolist() == [0.0] * 3
@@ -131,7 +131,7 @@ def test_a_sample_shows_how_much_far_longer_runs_shorten_best_known_tours(monkey
     cell, folder, sampled = TINY[1].cell(20), places["folder"], places["out"].with_name("gaps-sample.json")
     instances = cell.instances(7)
     optimal = [improve(instance, iterations=1000) for instance in instances]
-    proved = [makespan(x.nodes, tours) <= lower_bound(x) + 1e-9 for x, tours in zip(instances, optimal, strict=True)]
+    proved = [makespan(x, tours) <= lower_bound(x) + 1e-9 for x, tours in zip(instances, optimal, strict=True)]
     assert 0 < sum(proved) < 17  # at least four are not
     known, better = [[0, *range(1, 6), 0], [0, 0], [0, 0]], [[0, 1, 2, 0], [0, 3, 4, 0], [0, 5, 0]]
     best_known.merge(cell, 7, {i: optimal[i] if proved[i] else known for i in range(20)}, folder)
@@ -150,7 +150,7 @@ def test_a_sample_shows_how_much_far_longer_runs_shorten_best_known_tours(monkey
     monkeypatch.setattr(reference_gaps, "improve", improve_three_times)
     two = run(2)
     for i in map(int, two):
-        gain = 1.0 - makespan(instances[i].nodes, better) / makespan(instances[i].nodes, known)
+        gain = 1.0 - makespan(instances[i], better) / makespan(instances[i], known)
         assert gain > 0.1 and two[str(i)] == pytest.approx(gain)
         assert best_known.read(cell, 7, folder)[i] == better
     assert run(2) == two and len(calls) == 2  # none is repeated

@@ -5,6 +5,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tensordict import TensorDict
 
 from benchmarks.policies.nearest import nearest
 from dan_policy import make_actor, solve
@@ -18,10 +19,11 @@ def moments(instance: Instance, seed: int, depot: str = "final") -> list[tuple[r
     """Every state of a random game but the last, and the tours so far."""
     env = BatchedMTSP(instance.n_nodes, instance.n_agents, [1], SPEED, depot=depot)
     torch.manual_seed(seed)
-    td = env.reset(env.reset().set("nodes", torch.tensor(instance.nodes)[None]).select("nodes"), set_state=True)
+    td = env.reset(TensorDict({"game": {"nodes": torch.tensor(instance.nodes)[None]}}, [1]), set_state=True)
     found = []
     while not td["done"].item():
-        state = rules.State(*(td[name].numpy() for name in rules.State._fields))
+        arrays = {name: array.numpy() for name, array in td["game"].items()}
+        state = rules.state_from_arrays(arrays, instance.n_agents)
         found.append((state, rules.tours(state.visits[0], state.destination[0], close=False)))
         td = env.step(env.rand_action(td))["next"]
     return found
@@ -34,8 +36,8 @@ def test_prefixes_lead_to_the_very_moment_that_they_were_taken_at(seed: int, n_n
     game = rules.make_rules(n_nodes, n_agents, SPEED, "final", "sparse", None)
     for state, prefixes in moments(instance, seed):
         again = _set_out(instance, game, prefixes)
-        for name in rules.State._fields:
-            np.testing.assert_allclose(getattr(again, name), getattr(state, name), rtol=0, atol=1e-12, err_msg=name)
+        for name, array in state.arrays().items():
+            np.testing.assert_allclose(again.arrays()[name], array, rtol=0, atol=1e-12, err_msg=name)
 
 
 @pytest.mark.parametrize("policy", ["default", make_actor(nearest)], ids=["DAN", "nearest"])

@@ -61,7 +61,7 @@ def test_a_run_from_end_to_end(tmp_path, capsys):
     results = rows.read(out)
     for row in results:
         check_tours(instances[row.instance], row.tours)
-        assert row.makespan == makespan(instances[row.instance].nodes, row.tours)
+        assert row.makespan == makespan(instances[row.instance], row.tours)
         assert (row.table, row.cell, row.seed, row.status, row.error) == ("smoke", "8x2", 7, "ok", None)
         assert row.name == instances[row.instance].name
         assert row.seconds > 0 and row.cpu_seconds >= 0

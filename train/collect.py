@@ -14,7 +14,7 @@ from dan_policy.actor import OBSERVATION, make_actor
 from dan_policy.episode import Decode, Episode, rollout
 from dan_policy.symmetry import views
 from mtsp_env.batched import BatchedMTSP
-from mtsp_env.instance import sample_nodes
+from mtsp_env.distributions import sample
 from train.config import RunConfig
 
 
@@ -45,8 +45,8 @@ def draw(
     """
     n_nodes, n_agents = size or draw_size(rng, config)
     batch = batch if tokens is None else max(1, min(batch, tokens // n_nodes))
-    nodes = sample_nodes(config.distribution, rng, batch, n_nodes)
-    return Instances(torch.as_tensor(nodes, device=config.device), n_agents)
+    problem = sample(config.distribution, rng, batch, n_nodes, n_agents)
+    return Instances(torch.as_tensor(problem.nodes, device=config.device), n_agents)
 
 
 def repeat(instances: Instances, samples: int) -> Instances:

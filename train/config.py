@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Literal
 
 from dan_policy.network import DANConfig
-from mtsp_env.instance import check_count, check_distribution
+from mtsp_env.checks import check_count
+from mtsp_env.distributions import check_distribution
 
 # May differ between a run and its continuation; everything else is part of what is being trained.
 FREE_ON_RESUME = (

@@ -19,7 +19,8 @@ from torch import Tensor, nn
 from dan_policy.actor import OBSERVATION, make_actor
 from dan_policy.episode import rollout
 from mtsp_env import rules
-from mtsp_env.instance import Tours, sample_nodes
+from mtsp_env.distributions import sample
+from mtsp_env.instance import Tours
 from mtsp_env.tours import is_closed
 from train.collect import autocast, draw_size, environment
 from train.config import ImitateConfig
@@ -43,7 +44,7 @@ def demonstrate(config: ImitateConfig, index: int) -> Demonstrations:
     n_nodes, n_agents = draw_size(rng, config)
     batch = int(np.clip(config.set_tokens // n_nodes, 16, 256))
     batch = 1 << batch.bit_length() - 1  # few shapes: few kernels to build
-    nodes = sample_nodes(config.distribution, rng, batch, n_nodes)
+    nodes = sample(config.distribution, rng, batch, n_nodes, n_agents).nodes
     seed = int(rng.integers(2**31))
     begin = 0 if config.roll_in is None else int(rng.integers(n_nodes - 1))  # every game takes n - 1 or more
     prefixes = roll_in(config, nodes, n_agents, begin) if begin else [[[0]] * n_agents] * batch
@@ -60,7 +61,7 @@ def roll_in(config: ImitateConfig, nodes: np.ndarray, n_agents: int, begin: int)
     env = environment(nodes.shape[1], n_agents, len(nodes), config)
     with autocast(config):
         last = rollout(_student(config), env, "greedy", torch.from_numpy(nodes), most=begin).last
-    states = zip(last["visits"].numpy(), last["destination"].numpy(), strict=True)
+    states = zip(last["game", "visits"].numpy(), last["game", "destination"].numpy(), strict=True)
     return [rules.tours(*state, close=False) for state in states]
 
 
@@ -126,7 +127,7 @@ def follow(demonstrations: Demonstrations, device: torch.device | str = "cpu") -
         starts = first.gather(1, agent[:, None])
         return torch.where(at == 0, starts, following.gather(1, at))[:, 0]
 
-    return TensorDictModule(next_node, ["agent", "destination"], ["action"])
+    return TensorDictModule(next_node, ["agent", ("game", "destination")], ["action"])
 
 
 def replay(demonstrations: Demonstrations, config: ImitateConfig) -> tuple[TensorDictBase, Tensor]:

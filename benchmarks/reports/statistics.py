@@ -158,7 +158,7 @@ class _Judge:
             return
         instance = self._instance(cell, row.seed, row.instance)
         check_tours(instance, row.tours)
-        judged = makespan(instance.nodes, row.tours)
+        judged = makespan(instance, row.tours)
         if not math.isclose(judged, row.makespan, rel_tol=TIE):
             raise ValueError(f"its makespan is {row.makespan!r}, that of its tours {judged!r}")
 
@@ -216,5 +216,5 @@ def _include_kept(best: dict[InstanceKey, float], cell: AnyCell, seed: int, fold
     instances = cell.instances(seed)
     kept = {i: tours for i, tours in best_known.read(cell, seed, folder).items() if i in numbers}
     for i, tours in kept.items():
-        best[seed, i] = min(best[seed, i], makespan(instances[i].nodes, tours))
+        best[seed, i] = min(best[seed, i], makespan(instances[i], tours))
     return len(kept)

@@ -157,7 +157,7 @@ def gaps(network: nn.Module, cell: Cell, decode: Decode) -> list[float]:
     for i, instance in enumerate(instances):
         nodes = torch.as_tensor(instance.nodes.copy()).expand(batch, -1, -1)
         cost = float(env.makespan(rollout(actor, env, decode, nodes).last).min())
-        values.append(cost / makespan(instance.nodes, kept[i]) - 1)
+        values.append(cost / makespan(instance, kept[i]) - 1)
     return values
 
 

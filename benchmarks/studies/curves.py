@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from benchmarks.files import write_text
 from benchmarks.harness.machine import describe_machine
 from benchmarks.reports.plots import save
+from mtsp_env.instance import Instance
 from mtsp_env.reference import improve_batch
 from mtsp_env.tours import makespan
 from train import checkpoint
@@ -85,7 +86,8 @@ def reference_cost(config: RunConfig) -> float:
     for part in draw_set(np.random.default_rng(VALIDATION_SEED), config, config.validation_instances):
         nodes = part.nodes.numpy()
         tours = improve_batch(nodes, part.n_agents, iterations=500 * nodes.shape[1], seed=0)
-        costs += [makespan(*one) for one in zip(nodes, tours, strict=True)]
+        instances = [Instance(one, part.n_agents) for one in nodes]
+        costs += [makespan(instance, one) for instance, one in zip(instances, tours, strict=True)]
     return float(np.mean(costs))
 
 

@@ -118,7 +118,7 @@ def _find_optimum(instance: Instance, backend: str, seed: int) -> Optimum:
     tours = [reference.solve(instance, REFERENCE_SECONDS, seed), lkh3.solve(instance, LKH_SECONDS, seed)]
     for one in (proof.tours, *tours):
         check_tours(instance, one)
-    costs = [makespan(instance.nodes, one) for one in tours]
+    costs = [makespan(instance, one) for one in tours]
     return Optimum(instance.name, proof, seconds, optimal_makespan(instance), *costs)
 
 

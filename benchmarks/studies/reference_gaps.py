@@ -183,7 +183,7 @@ def run_sample(cell: Cell, seed: int, seconds: float, count: int, workers: int, 
     instances, kept = cell.instances(seed), best_known.read(cell, seed, folder)
     key = _sample_key(cell, seed, seconds)
     reduction = _read_json(file).get(key, {})
-    cost = {i: makespan(instances[i].nodes, tours) for i, tours in kept.items()}
+    cost = {i: makespan(instances[i], tours) for i, tours in kept.items()}
     order = [int(i) for i in np.random.default_rng(seed).permutation(cell.count)]
     unproved = [i for i in order if i in cost and cost[i] > lower_bound(instances[i]) + best_known.TOLERANCE]
     jobs = [i for i in unproved if str(i) not in reduction][: max(count - len(reduction), 0)]
@@ -193,7 +193,7 @@ def run_sample(cell: Cell, seed: int, seconds: float, count: int, workers: int, 
 
     for i, tours in _in_threads(run, jobs, workers, f"{cell.label}: {seconds:g} s"):
         best_known.merge(cell, seed, {i: tours}, folder)
-        reduction[str(i)] = max(0.0, 1.0 - makespan(instances[i].nodes, tours) / cost[i])
+        reduction[str(i)] = max(0.0, 1.0 - makespan(instances[i], tours) / cost[i])
         write_text(file, json.dumps({**_read_json(file), key: reduction}))
 
 
@@ -214,8 +214,8 @@ def measure(target: Target, cell: Cell, seed: int, out: Path, folder: Path, samp
         cpu.append(time.process_time() - cpu_start)
     best_known.merge(cell, seed, tours, folder)
     kept = best_known.read(cell, seed, folder)
-    cost = np.array([makespan(instance.nodes, tours[i]) for i, instance in enumerate(instances)])
-    best = np.array([makespan(instance.nodes, kept[i]) for i, instance in enumerate(instances)])
+    cost = np.array([makespan(instance, tours[i]) for i, instance in enumerate(instances)])
+    best = np.array([makespan(instance, kept[i]) for i, instance in enumerate(instances)])
     bound = np.array([lower_bound(instance) for instance in instances])
     reduction = _read_json(_sample_file(out)).get(_sample_key(cell, seed, sample_seconds), {})
     return Outcome(
