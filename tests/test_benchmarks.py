@@ -231,7 +231,7 @@ def test_peers_are_measured_in_turns_and_compared(monkeypatch, tmp_path):
 
     def measure_rl4co(python, batch, seconds):
         calls.append(batch)
-        return {"rl4co": "0.7.0"}, speed_peers.Timings([100.0], [200.0], [0.5])
+        return {"rl4co": "0.7.0"}, speed_peers.Timings([[100.0, 100.0]], [[200.0, 200.0]], [batch])
 
     monkeypatch.setattr(speed_peers, "measure_rl4co", measure_rl4co)
     monkeypatch.setattr(speed_peers, "BATCHES", (2, 3))
@@ -242,6 +242,14 @@ def test_peers_are_measured_in_turns_and_compared(monkeypatch, tmp_path):
     assert columns[0] == ["RL4CO MTSPEnv", "BatchedMTSP"] * 2 and columns[1] == ["2", "2", "3", "3"]
     assert columns[2][::2] == ["100000.000"] * 2 and columns[4] == ["1.00", "0.00"] * 2
     assert all(float(ratio) > 10 for ratio in columns[8][1::2])
+
+
+def test_interrupted_steps_do_not_count():
+    episodes = [[1.0, 9.0, 3.0], [9.0, 2.0, 9.0]]
+    assert speed_peers.best(episodes) == 2.0 and speed_peers.typical(episodes) == 6.0
+    timings = speed_peers.Timings(episodes, episodes, [12, 12])
+    timings.extend(speed_peers.Timings([], [[1.0, 1.0, 1.0]], [12]))
+    assert timings.decisions_per_second == 4.0
 
 
 def test_a_missing_peer_is_an_error_with_instructions(tmp_path, capsys):

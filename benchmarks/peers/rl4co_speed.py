@@ -6,6 +6,7 @@ Run it with the Python of an environment that has RL4CO (README.md); it imports 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import time
 from importlib.metadata import version
@@ -20,38 +21,34 @@ def draw(td: TensorDict) -> torch.Tensor:
     return torch.multinomial(td["action_mask"].float(), 1).squeeze(-1)
 
 
-def env_seconds(env: MTSPEnv, batch: int) -> float:
-    """Mean seconds of ``env.step`` in a random episode, without drawing the actions."""
-    td = env.reset(batch_size=[batch])
-    spent, steps = 0.0, 0
+def env_seconds(env: MTSPEnv, batch: int) -> list[float]:
+    """Seconds of each ``env.step`` of a random episode, without drawing the actions."""
+    td, seconds = env.reset(batch_size=[batch]), []
     while not td["done"].all():
         td.set("action", draw(td))
         start = time.perf_counter()
         td = env.step(td)["next"]
-        spent += time.perf_counter() - start
-        steps += 1
-    return spent / steps
+        seconds.append(time.perf_counter() - start)
+    return seconds
 
 
-def loop_seconds(env: MTSPEnv, batch: int) -> tuple[float, float]:
-    """Mean seconds of a step of a random episode, drawing included, and decisions per second.
+def loop_seconds(env: MTSPEnv, batch: int) -> tuple[list[float], int]:
+    """Seconds of each pass of the loop of a random episode, drawing included, and the number of decisions.
 
     Finished rows are stepped along with the others; these further steps do not count as decisions.
     """
-    td = env.reset(batch_size=[batch])
-    done = []
-    start = time.perf_counter()
+    td, done, times = env.reset(batch_size=[batch]), [], [time.perf_counter()]
     while not td["done"].all():
         td.set("action", draw(td))
         td = env.step(td)["next"]
         done.append(td["done"])
-    seconds = time.perf_counter() - start
+        times.append(time.perf_counter())
     decisions = int((~torch.stack(done)).sum()) + batch
-    return seconds / len(done), decisions / seconds
+    return [end - start for start, end in itertools.pairwise(times)], decisions
 
 
 def main() -> None:
-    """Print package versions and measurements, one value for each episode."""
+    """Print package versions and measurements: a list for each episode, with a value for each of its steps."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--nodes", type=int, default=50, help="number of nodes with the depot (RL4CO's num_loc)")
     parser.add_argument("--agents", type=int, default=5, help="number of agents")
@@ -72,7 +69,7 @@ def main() -> None:
         "versions": {name: version(name) for name in ("rl4co", "torch", "torchrl", "tensordict")},
         "env": env_times,
         "loop": [seconds for seconds, _ in loops],
-        "decisions_per_second": [rate for _, rate in loops],
+        "decisions": [decisions for _, decisions in loops],
     }
     print(json.dumps(report))
 

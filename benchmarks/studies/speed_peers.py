@@ -8,12 +8,13 @@ speed affects them alike.
 
 from __future__ import annotations
 
+import itertools
 import json
 import subprocess
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from statistics import median
+from statistics import mean, median
 
 import torch
 from rich.table import Table
@@ -31,23 +32,42 @@ RL4CO, EAGER, COMPILED = "RL4CO MTSPEnv", "BatchedMTSP", "BatchedMTSP, compiled"
 
 @dataclass
 class Timings:
-    """Measurements of one environment and batch size; one value for each episode.
+    """Measurements of one environment and batch size: a list for each episode, with a value for each of its steps.
 
     Attributes:
-        env: seconds of ``env.step`` for a step, without drawing the action.
-        loop: seconds of the whole loop for a step, drawing included.
-        decisions_per_second: decisions per second of the whole loop; those of finished games do not count.
+        env: seconds of ``env.step``, without drawing the action.
+        loop: seconds of a whole pass of the loop, drawing included.
+        decisions: decisions of each episode in ``loop``; those of finished games do not count.
     """
 
-    env: list[float] = field(default_factory=list)
-    loop: list[float] = field(default_factory=list)
-    decisions_per_second: list[float] = field(default_factory=list)
+    env: list[list[float]] = field(default_factory=list)
+    loop: list[list[float]] = field(default_factory=list)
+    decisions: list[int] = field(default_factory=list)
 
     def extend(self, other: Timings) -> None:
         """Add the measurements of more episodes."""
         self.env += other.env
         self.loop += other.loop
-        self.decisions_per_second += other.decisions_per_second
+        self.decisions += other.decisions
+
+    @property
+    def decisions_per_second(self) -> float:
+        """Decisions per second of the whole loop, at its best."""
+        steps = mean(len(episode) for episode in self.loop)
+        return mean(self.decisions) / (steps * best(self.loop))
+
+
+def best(episodes: list[list[float]]) -> float:
+    """Mean over an episode's steps of the shortest time that each of them took in any episode.
+
+    On a busy machine every episode is interrupted at some steps, but no step is interrupted in all episodes.
+    """
+    return mean(min(times) for times in zip(*episodes, strict=False))
+
+
+def typical(episodes: list[list[float]]) -> float:
+    """Median over all steps of all episodes."""
+    return median(time for episode in episodes for time in episode)
 
 
 def speed_table(seconds: float, repeats: int, python: Path = PYTHON, compiled: bool = True) -> Table:
@@ -102,7 +122,7 @@ def measure(env: BatchedMTSP, seconds: float) -> Timings:
         timings.env.append(env_seconds(env))
         loop, decisions = loop_seconds(env)
         timings.loop.append(loop)
-        timings.decisions_per_second.append(decisions)
+        timings.decisions.append(decisions)
     return timings
 
 
@@ -111,31 +131,27 @@ def draw(td: TensorDictBase) -> torch.Tensor:
     return torch.multinomial(td["action_mask"].float(), 1).squeeze(-1)
 
 
-def env_seconds(env: BatchedMTSP) -> float:
-    """Mean seconds of ``env.step`` in a random episode, without drawing the actions."""
-    td = env.reset()
-    spent, steps = 0.0, 0
+def env_seconds(env: BatchedMTSP) -> list[float]:
+    """Seconds of each ``env.step`` of a random episode, without drawing the actions."""
+    td, seconds = env.reset(), []
     while not td["done"].all():
         td.set("action", draw(td))
         start = time.perf_counter()
         td = env.step(td)["next"]
-        spent += time.perf_counter() - start
-        steps += 1
-    return spent / steps
+        seconds.append(time.perf_counter() - start)
+    return seconds
 
 
-def loop_seconds(env: BatchedMTSP) -> tuple[float, float]:
-    """Mean seconds of a step of a random episode, drawing included, and decisions per second."""
-    td = env.reset()
-    done = []
-    start = time.perf_counter()
+def loop_seconds(env: BatchedMTSP) -> tuple[list[float], int]:
+    """Seconds of each pass of the loop of a random episode, drawing included, and the number of decisions."""
+    td, done, times = env.reset(), [], [time.perf_counter()]
     while not td["done"].all():
         td.set("action", draw(td))
         td = env.step(td)["next"]
         done.append(td["done"])
-    seconds = time.perf_counter() - start
+        times.append(time.perf_counter())
     decisions = int((~torch.cat(done)).sum()) + len(done[0])
-    return seconds / len(done), decisions / seconds
+    return [end - start for start, end in itertools.pairwise(times)], decisions
 
 
 def measure_rl4co(python: Path, batch: int, seconds: float) -> tuple[dict[str, str], Timings]:
@@ -151,7 +167,7 @@ def measure_rl4co(python: Path, batch: int, seconds: float) -> tuple[dict[str, s
         last_line = (process.stderr.strip().splitlines() or ["no message"])[-1]
         raise OSError(f"{python} cannot run {FOLDER / 'rl4co_speed.py'} ({FOLDER / 'README.md'}): {last_line}")
     report = json.loads(process.stdout)
-    return report["versions"], Timings(report["env"], report["loop"], report["decisions_per_second"])
+    return report["versions"], Timings(report["env"], report["loop"], report["decisions"])
 
 
 def _table(timings: dict[tuple[str, int], Timings], versions: dict[str, str], title: str) -> Table:
@@ -176,12 +192,12 @@ def _table(timings: dict[tuple[str, int], Timings], versions: dict[str, str], ti
                 table.add_row(
                     name,
                     str(batch),
-                    f"{1e3 * min(values.env):.3f}",
-                    f"{1e3 * median(values.env):.3f}",
-                    f"{min(values.env) / min(base.env):.2f}",
-                    f"{median(values.env) / median(base.env):.2f}",
-                    f"{1e3 * min(values.loop):.3f}",
-                    f"{max(values.decisions_per_second):,.0f}",
-                    f"{max(values.decisions_per_second) / max(base.decisions_per_second):.2f}",
+                    f"{1e3 * best(values.env):.3f}",
+                    f"{1e3 * typical(values.env):.3f}",
+                    f"{best(values.env) / best(base.env):.2f}",
+                    f"{typical(values.env) / typical(base.env):.2f}",
+                    f"{1e3 * best(values.loop):.3f}",
+                    f"{values.decisions_per_second:,.0f}",
+                    f"{values.decisions_per_second / base.decisions_per_second:.2f}",
                 )
     return table
