@@ -1,33 +1,62 @@
-"""Any network, observation -> logits, as a TorchRL policy. Knows no environment."""
+"""Any network, from an observation to logits, as a TorchRL policy. This module knows no environment.
+
+A *network* is a module or a plain function that takes the tensors of its ``in_keys`` in order and returns logits
+(..., n). Attributes that it may have:
+
+- ``in_keys``: the keys of the observation that it reads, by default ``OBSERVATION``; a nested key is a tuple;
+- ``config``: a dataclass. ``dan_policy.solve`` can change its fields ``tanh_clip``, ``view`` and ``prune_visited``, if
+  it has them, for one call, so the network should read them in each forward pass;
+- ``supports_bfloat16``: True if its matrix products may run in bfloat16 under ``torch.autocast``.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import MaskedCategorical, ProbabilisticActor
 
-OBSERVATION = ("cities", "agents", "visited")
+Network = Callable[..., Tensor]
+"""A module or a plain function: the tensors of its ``in_keys`` -> logits (..., n)."""
+
+Key = str | tuple[str, ...]
+"""A key of a TensorDict; a tuple leads into nested ones."""
+
+OBSERVATION: tuple[Key, ...] = ("cities", "agents", "visited")
 
 
-def make_actor(network: Callable[..., Tensor], in_keys: Sequence[str] = OBSERVATION) -> ProbabilisticActor:
+def make_actor(network: Network, in_keys: Sequence[Key] | None = None) -> ProbabilisticActor:
     """A TorchRL actor that samples ``action`` from the softmax of the network's logits over ``action_mask``.
 
     Args:
-        network: a module or a plain function; called with the tensors of ``in_keys`` (cities (..., n, 2), agents
-            (..., m, 3), visited (..., n)), returns logits (..., n). Masked nodes get probability 0 in any case.
-        in_keys: observation keys that it takes, in order; ``action_mask`` may be one of them.
+        network: a module or a plain function. It is called with the tensors of ``in_keys``, for example cities
+            (..., n, 2), agents (..., m, 3) and visited (..., n), and returns logits (..., n). Masked nodes get
+            probability 0, whatever their logits.
+        in_keys: the keys of the observation that it takes, in order; ``action_mask`` and nested keys such as
+            ``("game", "nodes")`` may be among them. None: the network's attribute ``in_keys``, or ``OBSERVATION`` if
+            it has none.
 
     Returns:
-        A ``ProbabilisticActor``: sampling by default; greedy under
+        A ``ProbabilisticActor`` that samples by default, and is greedy under
         ``torchrl.envs.set_exploration_type(ExplorationType.DETERMINISTIC)``.
     """
+    keys = list(network_keys(network) if in_keys is None else in_keys)
     return ProbabilisticActor(
-        TensorDictModule(network, list(in_keys), ["logits"]),
+        TensorDictModule(network, keys, ["logits"]),
         in_keys={"logits": "logits", "mask": "action_mask"},
         out_keys=["action"],
         distribution_class=MaskedCategorical,
         default_interaction_type=ExplorationType.RANDOM,
     )
+
+
+def as_actor(policy: Network | TensorDictModuleBase) -> TensorDictModuleBase:
+    """``policy`` itself if it is an actor, that is, reads and writes TensorDicts; else the actor of this network."""
+    return policy if isinstance(policy, TensorDictModuleBase) else make_actor(policy)
+
+
+def network_keys(network: Network) -> tuple[Key, ...]:
+    """The keys of the observation that ``network`` takes: its attribute ``in_keys``, or ``OBSERVATION``."""
+    return tuple(getattr(network, "in_keys", OBSERVATION))

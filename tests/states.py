@@ -1,4 +1,4 @@
-"""Comparing checkpoints bit by bit."""
+"""Comparing checkpoints bit for bit."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import torch
 
 def same(a: Any, b: Any) -> bool:
     """Whether two states of tensors, numbers, dicts and lists are equal in every bit."""
-    """Deep equality, to the bit."""
     if isinstance(a, torch.Tensor):
         return torch.equal(a, b)
     if isinstance(a, dict):

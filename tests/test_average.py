@@ -1,4 +1,4 @@
-"""Averaged weights are the mean, of networks that can be averaged, and say where they come from."""
+"""Averaged weights are the mean, say where they come from, and validate as in a run."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dan_policy import DAN, DANConfig, load, save
-from dan_policy.weights import load_extra
+from dan_policy.registry import load_extra
 from train.__main__ import main
 from train.presets import REFINE
 from train.reinforce import reinforce
@@ -47,7 +47,7 @@ def test_what_cannot_be_averaged_is_refused(files, tmp_path, capsys):
     save(other, DAN(DANConfig(embed_dim=16, feedforward_dim=16, n_heads=2, city_layers=1)))
     for named, message in (
         (files[:1], "name at least 2 files to average, got 1"),
-        ([files[0], str(other)], "other.safetensors: another configuration than"),
+        ([files[0], str(other)], "other.safetensors has another configuration than"),
         ([files[0], str(tmp_path / "none.safetensors")], "none.safetensors"),
     ):
         assert main(["average", *named, "--out", str(out)]) == 2

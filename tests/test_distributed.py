@@ -1,4 +1,4 @@
-"""K processes take the step that one would take with all their episodes; they stop and decide together."""
+"""Two processes take the step that one would take with all their episodes; they stop and decide together."""
 
 import os
 import subprocess
@@ -29,7 +29,7 @@ def torchrun(*arguments, processes=2):
 
 
 def gradient(network, seeds):
-    """Of the mean over the episodes of all ``seeds``, five each, whose advantages are made up."""
+    """Add the gradient of the mean over five episodes per seed, with made-up advantages. Returns how many decisions."""
     total = 0
     for seed in seeds:
         torch.manual_seed(seed)
@@ -41,16 +41,16 @@ def gradient(network, seeds):
 
 
 def one_process(folder):
-    """What each of the processes below runs: its own episodes, then the mean of everybody's gradients."""
+    """What each process of the test below runs: the gradient of its own episodes, then the mean over all processes."""
     torch.manual_seed(0)
     network = DAN(TINY.network)
     with distributed.processes("cpu"):
         gradient(network, [distributed.rank()])
         distributed.average_gradients(network)
         gathered = distributed.gather(torch.tensor([float(distributed.rank())]))
-        said = distributed.anyone(distributed.rank() == 1, "cpu"), distributed.anyone(False, "cpu")
+        votes = distributed.any_process(distributed.rank() == 1, "cpu"), distributed.any_process(False, "cpu")
         gradients = {name: p.grad for name, p in network.named_parameters()}
-        checkpoint.write(Path(folder) / str(distributed.rank()), {"grad": gradients, "all": gathered, "said": said})
+        checkpoint.write(Path(folder) / str(distributed.rank()), {"grad": gradients, "all": gathered, "votes": votes})
 
 
 def test_two_processes_have_the_gradient_of_one_with_all_their_episodes(tmp_path):
@@ -59,11 +59,11 @@ def test_two_processes_have_the_gradient_of_one_with_all_their_episodes(tmp_path
     network = DAN(TINY.network)
     gradient(network, [0, 1])
     for rank in ("0", "1"):
-        found = checkpoint.read(tmp_path / rank)
+        result = checkpoint.read(tmp_path / rank)
         for name, parameter in network.named_parameters():
-            torch.testing.assert_close(found["grad"][name], parameter.grad, rtol=1e-4, atol=1e-6)
-        assert found["all"].tolist() == [0.0, 1.0]
-        assert found["said"] == (True, False)
+            torch.testing.assert_close(result["grad"][name], parameter.grad, rtol=1e-4, atol=1e-6)
+        assert result["all"].tolist() == [0.0, 1.0]
+        assert result["votes"] == (True, False)
 
 
 def test_training_under_torchrun_keeps_the_processes_alike_and_resumes(tmp_path):
@@ -77,7 +77,7 @@ def test_training_under_torchrun_keeps_the_processes_alike_and_resumes(tmp_path)
     assert one["progress"]["instances"] == 3 * 4 * 2
     for name, value in one["network"].items():
         assert torch.equal(value, other["network"][name])
-    assert one["random"]["numpy"] != other["random"]["numpy"]  # each has its own instances
+    assert one["random"]["numpy"] != other["random"]["numpy"]  # each draws its own instances
     assert not torch.equal(one["baseline"]["test_costs"], other["baseline"]["test_costs"])
 
 
@@ -86,7 +86,7 @@ def test_alone_everything_is_the_identity():
         values = torch.rand(3)
         assert distributed.gather(values) is values
         assert (distributed.rank(), distributed.world_size()) == (0, 1)
-        assert distributed.anyone(True, "cpu") and not distributed.anyone(False, "cpu")
+        assert distributed.any_process(True, "cpu") and not distributed.any_process(False, "cpu")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
-"""Demonstrations are the teacher's tours in one canonical form; learning from them resumes bit by bit and learns."""
+"""Demonstrations are the teacher's tours in one canonical form; learning from them lowers costs and resumes bit for
+bit."""
 
 import signal
 from dataclasses import replace
@@ -13,17 +14,19 @@ from states import same
 from dan_policy import DAN, DANConfig, load, save
 from dan_policy.episode import rollout
 from mtsp_env import check_tours, makespan
-from mtsp_env.instance import Instance
+from mtsp_env.instance import Instance, Problem
 from train import checkpoint
 from train.__main__ import main
 from train.baseline import better
-from train.collect import Instances, costs, environment, play
+from train.buffer import Buffer
+from train.collect import costs, environment, play
 from train.config import ImitateConfig
-from train.demonstrations import as_links, canonical, demonstrate, follow, replay
-from train.imitate import Buffer, Imitator, imitate, rate
+from train.demonstrations import Demonstrations, as_decisions, as_links, canonical, demonstrate, follow
+from train.imitate import ImitationLearner, imitate, rate
 
 pytest.importorskip("numba", reason="the teacher is compiled with Numba")
 
+KEYS = ("cities", "agents", "visited", "action_mask")
 TINY = ImitateConfig(
     n_nodes=(6, 9),
     n_agents=(1, 3),
@@ -31,7 +34,7 @@ TINY = ImitateConfig(
     network=DANConfig(embed_dim=16, feedforward_dim=32, n_heads=2, city_layers=1, prune_visited=True),
     set_tokens=100,
     buffer=3,
-    rows=2,
+    sets_per_step=2,
     workers=0,
     teacher_iterations=20,
     warmup=2,
@@ -46,7 +49,7 @@ TINY = ImitateConfig(
 
 @st.composite
 def solved(draw):
-    """An instance and any tours that solve it, idle agents and clockwise tours among them."""
+    """An instance and random tours that solve it, including idle agents and clockwise tours."""
     n_nodes, seed = draw(st.integers(2, 14)), draw(st.integers(0, 2**32 - 1))
     n_agents = draw(st.integers(1, n_nodes - 1))
     rng = np.random.default_rng(seed)
@@ -58,41 +61,41 @@ def solved(draw):
 
 @given(solved())
 @settings(max_examples=200, deadline=None)
-def test_canonical_tours_solve_the_same_instance_no_worse_in_one_order_whatever_they_came_in(case):
+def test_canonical_tours_solve_the_same_instance_no_worse_and_in_one_order(case):
     instance, tours = case
-    found = canonical(instance.nodes, tours)
-    check_tours(instance, found)
-    assert makespan(instance, found) <= makespan(instance, tours) + 1e-12
-    assert all(len(tour) > 2 for tour in found)  # nobody stays at home
+    ordered = canonical(instance.nodes, tours)
+    check_tours(instance, ordered)
+    assert makespan(instance, ordered) <= makespan(instance, tours) + 1e-12
+    assert all(len(tour) > 2 for tour in ordered)  # nobody stays at home
     turned = [tour[::-1] for tour in tours[::-1]]
     if all(len(tour) > 2 for tour in tours):
-        assert sorted(map(sorted, found)) == sorted(map(sorted, tours))  # the same division of the cities
-        assert [t for t in canonical(instance.nodes, turned) if len(t) > 3] == [t for t in found if len(t) > 3]
+        assert sorted(map(sorted, ordered)) == sorted(map(sorted, tours))  # the same division of the cities
+        assert [t for t in canonical(instance.nodes, turned) if len(t) > 3] == [t for t in ordered if len(t) > 3]
 
 
 @given(solved(), st.data())
 @settings(max_examples=200, deadline=None)
 def test_canonical_tours_begin_as_they_began(case, data):
-    """Whatever was driven stays; who is still at the depot does not stay there while others have two cities left."""
+    """Prefixes stay as they are; no agent stays at the depot while another one has two cities left."""
     instance, tours = case
     prefixes = [tour[: data.draw(st.integers(1, len(tour) - 1))] for tour in tours]
     closed = [len(prefix) > 1 and data.draw(st.booleans()) for prefix in prefixes]
     prefixes = [tour if home and tour == [*prefix, 0] else prefix
                 for tour, prefix, home in zip(tours, prefixes, closed, strict=True)]  # fmt: skip
-    found = canonical(instance.nodes, tours, prefixes)
-    check_tours(instance, found)
-    assert makespan(instance, found) <= makespan(instance, tours) + 1e-12
-    assert all(tour[: len(prefix)] == prefix for tour, prefix in zip(found, prefixes, strict=True))
-    waiting = [tour for tour, prefix in zip(found, prefixes, strict=True) if prefix == [0]]
+    ordered = canonical(instance.nodes, tours, prefixes)
+    check_tours(instance, ordered)
+    assert makespan(instance, ordered) <= makespan(instance, tours) + 1e-12
+    assert all(tour[: len(prefix)] == prefix for tour, prefix in zip(ordered, prefixes, strict=True))
+    waiting = [tour for tour, prefix in zip(ordered, prefixes, strict=True) if prefix == [0]]
     if [0, 0] in waiting:
         assert all(len(tour) <= 3 for tour in waiting)
-        under_way = [pair for pair in zip(found, prefixes, strict=True) if len(pair[1]) > 1]
-        assert all(len(tour) <= len(prefix) + 1 for tour, prefix in under_way)  # nothing left to take over
+        under_way = [pair for pair in zip(ordered, prefixes, strict=True) if len(pair[1]) > 1]
+        assert all(len(tour) <= len(prefix) + 1 for tour, prefix in under_way)  # no city is left to take over
         assert waiting.index([0, 0]) == sum(tour != [0, 0] for tour in waiting)  # the idle ones come last
 
 
 def test_tours_run_counter_clockwise_and_agents_go_by_angle():
-    """The depot in the middle of a square of eight; west is where angles begin and end."""
+    """The depot in the middle of eight cities; angles begin and end in the west."""
     nodes = np.array([[0.5, 0.5], [1, 0.6], [0.6, 1], [0.4, 1], [0, 0.6], [0, 0.4], [0.4, 0], [0.6, 0], [1, 0.4]])
     tours = [[0, 2, 1, 0], [0, 4, 3, 0], [0, 8, 7, 0], [0, 6, 5, 0]]  # clockwise
     south_west, south_east, north_east, north_west = [0, 5, 6, 0], [0, 7, 8, 0], [0, 1, 2, 0], [0, 3, 4, 0]
@@ -105,16 +108,17 @@ def test_the_teachers_policy_plays_its_tours(case):
     instance, tours = case
     tours = canonical(instance.nodes, tours)
     first, following = (torch.as_tensor(part)[None].numpy() for part in as_links(tours, instance.n_nodes))
-    shown = type(demonstrate(TINY, 0))(instance.nodes[None], first, following)
-    env = environment(instance.n_nodes, instance.n_agents, 1, TINY)
-    episode = rollout(follow(shown), env, "greedy", torch.tensor(shown.nodes))
+    shown = Demonstrations(instance.nodes[None], first, following)
+    problem = as_problem(shown)
+    env = environment(problem, TINY)
+    episode = rollout(follow(shown), env, "greedy", problem)
     assert env.tours() == [tours]
     assert -float(episode.reward) == pytest.approx(makespan(instance, tours))
 
 
 def test_a_replayed_set_holds_every_decision_of_the_teachers_tours():
     shown = demonstrate(TINY, 3)
-    decisions, valid = replay(shown, TINY)
+    decisions, valid = as_decisions(shown, KEYS, TINY)
     batch, n_nodes = shown.nodes.shape[:2]
     assert decisions.shape == valid.shape and valid.shape[1] == batch
     for b in range(batch):
@@ -129,21 +133,25 @@ def test_sets_depend_on_their_index_alone_and_the_teacher_is_near_optimal():
     assert one.nodes.shape != other.nodes.shape or not np.array_equal(one.nodes, other.nodes)
     config = replace(TINY, n_nodes=(9, 9), n_agents=(2, 2), teacher_iterations=200)
     shown = demonstrate(config, 0)
-    taught = [float(part) for part in -replayed_rewards(shown, config)]
+    taught = [float(part) for part in teacher_costs(shown, config)]
     from mtsp_env.reference import improve
 
-    best = [makespan(x, improve(Instance(x, 2), iterations=5000)) for x in shown.nodes]
+    best = [makespan(one, improve(one, iterations=5000)) for one in (Instance(nodes, 2) for nodes in shown.nodes)]
     assert np.mean(taught) <= 1.002 * np.mean(best)  # tidy tours may give away a little of the makespan
 
 
-def replayed_rewards(shown, config):
-    env = environment(shown.nodes.shape[1], shown.first.shape[1], len(shown.nodes), config)
-    return rollout(follow(shown), env, "greedy", torch.as_tensor(shown.nodes)).reward
+def as_problem(shown):
+    return Problem(shown.first.shape[1], {"nodes": torch.tensor(shown.nodes)})
+
+
+def teacher_costs(shown, config):
+    problem = as_problem(shown)
+    return -rollout(follow(shown), environment(problem, config), "greedy", problem).reward
 
 
 @pytest.fixture
 def student(tmp_path):
-    """A network that has learnt nothing, and a run in which it plays the beginnings."""
+    """The options of a run in which an untrained network plays the beginning of each game."""
     torch.manual_seed(3)
     save(tmp_path / "student.safetensors", DAN(TINY.network))
     return replace(TINY, roll_in=str(tmp_path / "student.safetensors"))
@@ -153,7 +161,7 @@ def test_the_student_plays_the_beginning_and_the_teacher_goes_on(student):
     begun = set()
     for index in range(12):
         shown = demonstrate(student, index)
-        decisions, valid = replay(shown, student)
+        decisions, valid = as_decisions(shown, KEYS, student)
         assert 0 <= shown.begin < shown.nodes.shape[1] - 1 and valid[: shown.begin].all()
         logits = load(student.roll_in)(decisions["cities"], decisions["agents"], decisions["visited"])
         likeliest = logits.masked_fill(~decisions["action_mask"], -torch.inf).argmax(-1)
@@ -161,43 +169,43 @@ def test_the_student_plays_the_beginning_and_the_teacher_goes_on(student):
         assert same_choice[: shown.begin].all()
         assert not same_choice[shown.begin :].all()
         begun.add(shown.begin)
-        costs = -replayed_rewards(shown, student)
-        played = -play(load(student.roll_in), Instances(torch.tensor(shown.nodes), shown.first.shape[1]), student,
-                       "greedy").reward  # fmt: skip
-        assert (costs <= 1.01 * played).all()  # from there on as well as can be; tidy tours may give a little away
+        played = -play(load(student.roll_in), as_problem(shown), student, "greedy").reward
+        assert (
+            teacher_costs(shown, student) <= 1.01 * played
+        ).all()  # the teacher continues near-optimally; tidy tours may give away a little
     assert len(begun) > 3
 
 
 def test_what_comes_after_the_students_part_is_learnt_from(student):
     for passes in (1.0, 0.25):
-        buffer = Buffer(replace(student, passes=passes, rows=1, buffer=1), np.random.default_rng(0))
+        buffer = Buffer(replace(student, passes=passes, sets_per_step=1, buffer=1), KEYS, np.random.default_rng(0))
         for index in range(6):
             begin = demonstrate(student, index).begin
-            buffer._add(index)
+            buffer.add(index)
             (steps, (_, valid)) = buffer.left.pop(), buffer.sets.pop()
             count = max(1, round(passes * len(valid)))
             assert sorted(steps) == list(range(begin, min(len(valid), begin + count)))
 
 
 def test_workers_make_the_same_sets(student):
-    """Set i from another process is set i."""
-    rows = []
+    """Set i is the same whether a worker or this process makes it."""
+    cities = []
     for workers in (0, 1):
-        buffer = Buffer(replace(student, workers=workers), np.random.default_rng(0))
-        rows.append(torch.cat([row["cities"].flatten() for _ in range(3) for row in buffer.draw(2)]))
+        buffer = Buffer(replace(student, workers=workers), KEYS, np.random.default_rng(0))
+        cities.append(torch.cat([part["cities"].flatten() for _ in range(3) for part in buffer.draw(2)]))
         buffer.close()
-    assert torch.equal(*rows)
+    assert torch.equal(*cities)
 
 
 def test_every_decision_of_a_set_is_drawn_once():
-    buffer = Buffer(replace(TINY, rows=1, buffer=1), np.random.default_rng(0))
-    decisions, valid = replay(demonstrate(TINY, 0), TINY)
+    buffer = Buffer(replace(TINY, sets_per_step=1, buffer=1), KEYS, np.random.default_rng(0))
+    decisions, valid = as_decisions(demonstrate(TINY, 0), KEYS, TINY)
     drawn = torch.cat([buffer.draw(1)[0]["action"] for _ in range(len(valid))])
     assert buffer.sets == []  # used up: the next draw takes a fresh set
     assert sorted(drawn.tolist()) == sorted(decisions["action"][valid].tolist())
     buffer.draw(1)
     assert buffer.indices in ([1], [])
-    half = Buffer(replace(TINY, passes=0.5), np.random.default_rng(0))
+    half = Buffer(replace(TINY, passes=0.5), KEYS, np.random.default_rng(0))
     half.draw(2)
     assert sum(map(len, half.left)) + 2 == sum(round(0.5 * len(valid)) for _, valid in half.sets)
 
@@ -218,10 +226,10 @@ def test_resume_is_bit_identical(tmp_path, monkeypatch, student):
             signal.raise_signal(signal.SIGTERM)
         return logs
 
-    train_step = Imitator.train_step
-    monkeypatch.setattr(Imitator, "train_step", interrupted)
+    train_step = ImitationLearner.train_step
+    monkeypatch.setattr(ImitationLearner, "train_step", interrupted)
     assert imitate(replace(student, out=tmp_path / "parts")).step == 7
-    torch.manual_seed(123)  # whatever happened in between
+    torch.manual_seed(123)  # something else happened in between
     assert imitate(replace(student, out=tmp_path / "parts", resume=True)).step == 24
     whole, parts = (checkpoint.read(tmp_path / name / "checkpoint.pt") for name in ("whole", "parts"))
     for key in ("network", "average", "optimiser", "schedule", "buffer"):
@@ -241,19 +249,20 @@ def test_a_run_does_not_go_on_with_another_student(tmp_path, student):
 
 
 def test_imitation_learns_what_the_teacher_does(tmp_path):
-    """A few seconds in small: 150 steps at n = 10, m = 2 lower the greedy cost on held-out instances."""
+    """150 steps at n = 10, m = 2 lower the greedy cost on held-out instances."""
     config = replace(
-        TINY, out=tmp_path, n_nodes=(10, 10), n_agents=(2, 2), set_tokens=2000, rows=3, steps=150, average=0.9,
+        TINY, out=tmp_path, n_nodes=(10, 10), n_agents=(2, 2), set_tokens=2000, sets_per_step=3, steps=150, average=0.9,
         learning_rate=3e-3, warmup=10, validate_every=1000, checkpoint_every=1000,
         network=DANConfig(embed_dim=32, feedforward_dim=64, n_heads=4, city_layers=1, prune_visited=True),
     )  # fmt: skip
-    held_out = [Instances(torch.rand(256, 10, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1)), 2)]
-    before = costs(Imitator(config).policy(), held_out, config)
+    nodes = torch.rand(256, 10, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    held_out = [Problem(2, {"nodes": nodes})]
+    before = costs(ImitationLearner(config).averaged_network, held_out, config)
     learner = imitate(config)
-    after = costs(learner.policy(), held_out, config)
+    after = costs(learner.averaged_network, held_out, config)
     assert better(after, before, 1e-6)
     assert after.mean() < 0.85 * before.mean()  # 0.76
-    reward = play(learner.policy(), held_out[0], config, "greedy").reward
+    reward = play(learner.averaged_network, held_out[0], config, "greedy").reward
     assert torch.equal(-reward, after)
 
 
@@ -263,7 +272,7 @@ def test_imitation_learns_what_the_teacher_does(tmp_path):
         ({"depot": "open"}, "depot must be 'final'"),
         ({"n_nodes": (3, 9), "n_agents": (3, 3), "nodes_per_agent": 1}, r"n_nodes\[0\] must be above"),
         ({"nodes_per_agent": 11}, r"nodes_per_agent must be at most n_nodes\[0\] // n_agents\[0\] = 10, got 11"),
-        ({"rows": 17}, "rows must be at most buffer=16, got 17"),
+        ({"sets_per_step": 17}, "sets_per_step must be at most buffer=16, got 17"),
         ({"passes": 0.0}, "passes must be above 0 and at most 1"),
         ({"average": 1.0}, "average must be at least 0 and below 1"),
     ],
@@ -279,7 +288,7 @@ def test_the_command_line_imitates(tmp_path, capsys):
              "--no-tensorboard", "--teacher-iterations", "5"]  # fmt: skip
     assert main(["imitate", "--steps", "2", *small]) == 0
     assert main(["imitate", "--steps", "2", *small]) == 2
-    assert "give --resume" in capsys.readouterr().err
+    assert "add --resume" in capsys.readouterr().err
     assert main(["imitate", "--steps", "3", "--resume", *small]) == 0
     assert checkpoint.read(tmp_path / "checkpoint.pt")["progress"]["step"] == 3
 

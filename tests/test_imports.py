@@ -33,7 +33,8 @@ FORBIDDEN = {
     "mtsp_env/batched.py": ["mtsp_env.mtsp_v0", *EXTRAS],
     "mtsp_env/reference/solver.py": [*FACES, "mtsp_env.render", "mtsp_env.rules"],
     "mtsp_env/render.py": [*FACES, "mtsp_env.reference"],
-    "dan_policy/network.py": ["mtsp_env*"],
+    "dan_policy/dan.py": ["mtsp_env*"],
+    "dan_policy/layers.py": ["mtsp_env*"],
     "dan_policy/actor.py": ["mtsp_env*"],
     "benchmarks/peers/rl4co_speed.py": ["mtsp_env*", "dan_policy*", "train*", "benchmarks*"],
 }

@@ -1,4 +1,4 @@
-"""Ray workers play what one process would play with the same weights; a run with them continues bit by bit."""
+"""Ray workers play what one process would play with the same weights; a run with them continues bit for bit."""
 
 import sys
 from dataclasses import replace
@@ -15,6 +15,7 @@ from train.remote import RayWorkers, play_part, replay
 
 ray = pytest.importorskip("ray", reason="needs the extra ray")
 
+KEYS = ("cities", "agents", "visited", "action_mask")
 CONFIG = replace(
     QUICK,
     n_nodes=(5, 9),
@@ -30,7 +31,7 @@ CONFIG = replace(
 
 @pytest.fixture(scope="module")
 def cluster():
-    """A local one; what it says about itself stays out of the tests' output."""
+    """A local cluster that prints nothing."""
     ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
     yield
     ray.shutdown()
@@ -43,12 +44,12 @@ def network():
 
 
 @pytest.mark.parametrize("depot", ["final", "open"])
-def test_actions_alone_bring_an_episode_back(network, depot):
+def test_actions_alone_restore_an_episode(network, depot):
     config = replace(CONFIG, depot=depot)
-    instances = draw(np.random.default_rng(0), config, 6)
-    played = play(network, instances, config, "sample", keep=True)
+    problem = draw(np.random.default_rng(0), config, 6)
+    played = play(network, problem, config, "sample", keep=True)
     actions = torch.nn.functional.pad(played.decisions["action"].T, (0, 7))
-    again = replay(instances, actions, config)
+    again = replay(problem, actions, KEYS, config)
     assert torch.equal(again.reward, played.reward)
     assert torch.equal(again.valid, played.valid)
     assert (again.decisions[played.valid] == played.decisions[played.valid]).all()
@@ -56,25 +57,27 @@ def test_actions_alone_bring_an_episode_back(network, depot):
 
 def test_workers_play_their_parts_with_the_weights_of_the_moment(network, cluster):
     config = replace(CONFIG, samples=2, baseline="shared", curriculum=((5, 10, 12, 3, 3),))
-    workers = RayWorkers(network, config, first=3)
+    workers = RayWorkers(network, config, first_step=3)
     sizes = []
     for step in (3, 4, 5):
-        instances, episode = workers.collect()
+        problem, episode = workers.collect()
         parts = [play_part(network, config, step, worker) for worker in range(2)]
-        assert torch.equal(instances.nodes, torch.cat([part.nodes for part, _ in parts]))
+        assert torch.equal(problem.nodes, torch.cat([part.nodes for part, _ in parts]))
         assert torch.equal(episode.reward, torch.cat([part.reward for _, part in parts]))
-        sizes.append((*instances.nodes.shape[:2], instances.n_agents))
+        sizes.append((*problem.nodes.shape[:2], problem.n_agents))
         with torch.no_grad():
             for parameter in network.parameters():
                 parameter.add_(torch.randn_like(parameter))
     assert all(batch == 12 for batch, *_ in sizes)  # 2 workers, 3 instances, 2 samples
     assert [10 <= n <= 12 for _, n, _ in sizes] == [False, False, True]
-    assert not torch.equal(episode.reward, play_part(network, config, 5, 0)[1].reward.repeat(2))  # other weights now
+    assert not torch.equal(
+        episode.reward, play_part(network, config, 5, 0)[1].reward.repeat(2)
+    )  # the weights have changed
     workers.close()
     assert ray.is_initialized()  # not started by the workers
 
 
-def test_a_run_with_workers_continues_bit_by_bit(tmp_path, cluster):
+def test_a_run_with_workers_continues_bit_for_bit(tmp_path, cluster):
     whole = reinforce(replace(CONFIG, out=tmp_path / "whole", steps=3))
     reinforce(replace(CONFIG, out=tmp_path / "parts", steps=2))
     parts = reinforce(replace(CONFIG, out=tmp_path / "parts", steps=3, resume=True))
@@ -85,10 +88,10 @@ def test_a_run_with_workers_continues_bit_by_bit(tmp_path, cluster):
 
 def test_more_workers_than_cpus_are_refused(network, cluster):
     with pytest.raises(ValueError, match="ray_workers must be at most Ray's 2 CPUs, got 3"):
-        RayWorkers(network, replace(CONFIG, ray_workers=3), first=0)
+        RayWorkers(network, replace(CONFIG, ray_workers=3), first_step=0)
 
 
 def test_no_ray_names_the_extra(network, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ModuleNotFoundError, match=r"mtsp-env\[ray\]"):
-        RayWorkers(network, CONFIG, first=0)
+        RayWorkers(network, CONFIG, first_step=0)

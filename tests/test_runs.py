@@ -1,4 +1,4 @@
-"""What a training run leaves behind, how it goes on from there bit by bit, and what it refuses."""
+"""What a training run leaves behind, how it continues from there bit for bit, and what it refuses."""
 
 import signal
 from dataclasses import replace
@@ -12,8 +12,9 @@ from tiny import TINY
 from benchmarks.policies.attention_model import AttentionModel
 from dan_policy import load
 from train import checkpoint
-from train.config import ReinforceConfig, check_same_run
-from train.reinforce import Trainer, reinforce
+from train.checkpoint import check_same_run
+from train.config import ReinforceConfig
+from train.reinforce import ReinforceLearner, reinforce
 
 
 @pytest.mark.parametrize("average", [0.0, 0.9])
@@ -21,7 +22,7 @@ def test_resume_is_bit_identical(tmp_path, average):
     config = replace(TINY, average=average)
     reinforce(replace(config, out=tmp_path / "whole"))
     reinforce(replace(config, out=tmp_path / "parts", steps=3))
-    torch.manual_seed(123)  # whatever happened in between
+    torch.manual_seed(123)  # something else happened in between
     reinforce(replace(config, out=tmp_path / "parts", resume=True))
     whole, parts = (checkpoint.read(tmp_path / name / "checkpoint.pt") for name in ("whole", "parts"))
     for key in ("network", "average", "optimiser", "schedule", "baseline", "random"):
@@ -37,8 +38,8 @@ def test_an_interrupt_finishes_the_step_and_saves(tmp_path, monkeypatch):
             signal.raise_signal(signal.SIGINT)
         return logs
 
-    train_step = Trainer.train_step
-    monkeypatch.setattr(Trainer, "train_step", step_then_interrupt)
+    train_step = ReinforceLearner.train_step
+    monkeypatch.setattr(ReinforceLearner, "train_step", step_then_interrupt)
     before = signal.getsignal(signal.SIGINT)
     assert reinforce(replace(TINY, out=tmp_path, checkpoint_every=1000)).step == 3
     assert checkpoint.read(tmp_path / "checkpoint.pt")["progress"]["step"] == 3
@@ -47,7 +48,7 @@ def test_an_interrupt_finishes_the_step_and_saves(tmp_path, monkeypatch):
 
 def test_a_run_is_not_overwritten_nor_resumed_as_another(tmp_path):
     reinforce(replace(TINY, out=tmp_path, steps=1))
-    with pytest.raises(FileExistsError, match="give --resume"):
+    with pytest.raises(FileExistsError, match="add --resume"):
         reinforce(replace(TINY, out=tmp_path))
     with pytest.raises(ValueError, match="batch_size was 6, is 7"):
         reinforce(replace(TINY, out=tmp_path, resume=True, batch_size=7))
@@ -57,7 +58,7 @@ def test_a_run_is_not_overwritten_nor_resumed_as_another(tmp_path):
 
 
 def test_a_checkpoint_may_be_older_than_an_option():
-    """What it does not know had its default, then and now."""
+    """An option that it does not know had its default value."""
     older = TINY.to_dict()
     del older["average"], older["network"]["view"]
     check_same_run(older, TINY)
@@ -78,35 +79,37 @@ def test_a_damaged_checkpoint_is_refused(tmp_path):
 
 
 def test_logs_and_weights_are_left_behind(tmp_path):
-    trainer = reinforce(replace(TINY, out=tmp_path, tensorboard=True))
+    learner = reinforce(replace(TINY, out=tmp_path, tensorboard=True))
     cost = np.loadtxt(tmp_path / "logs/scalars/cost.csv", delimiter=",")
     assert cost[:, 0].tolist() == [1, 2, 3, 4, 5, 6]
     assert {p.name for p in tmp_path.glob("*.safetensors")} == {"best.safetensors", "last.safetensors"}
     assert list(tmp_path.glob("tensorboard/events*"))
-    continued = Trainer(replace(TINY, init=str(tmp_path / "last.safetensors")))
-    assert same(dict(continued.network.state_dict()), dict(trainer.network.state_dict()))
+    continued = ReinforceLearner(replace(TINY, init=str(tmp_path / "last.safetensors")))
+    assert same(dict(continued.network.state_dict()), dict(learner.network.state_dict()))
 
 
 def test_a_network_of_ones_own_is_trained_saved_and_continued(tmp_path):
     policy = "benchmarks.policies.attention_model:AttentionModel"
-    trainer = reinforce(replace(TINY, out=tmp_path, policy=policy, steps=2))
-    assert isinstance(trainer.network, AttentionModel)
-    again = Trainer(replace(TINY, policy=policy, init=str(tmp_path / "last.safetensors")))
-    assert same(dict(again.network.state_dict()), dict(trainer.network.state_dict()))
-    with pytest.raises(ValueError, match="it holds no DAN"):
-        Trainer(replace(TINY, init=str(tmp_path / "last.safetensors")))
-    with pytest.raises(ValueError, match=r"policy must be package.module:factory, got 'nothing.here:at_all'"):
-        Trainer(replace(TINY, policy="nothing.here:at_all"))
+    learner = reinforce(replace(TINY, out=tmp_path, policy=policy, steps=2))
+    assert isinstance(learner.network, AttentionModel)
+    again = ReinforceLearner(replace(TINY, policy=policy, init=str(tmp_path / "last.safetensors")))
+    assert same(dict(again.network.state_dict()), dict(learner.network.state_dict()))
+    with pytest.raises(ValueError, match="names the factory 'benchmarks.policies.attention_model:AttentionModel'"):
+        ReinforceLearner(replace(TINY, init=str(tmp_path / "last.safetensors")))
+    with pytest.raises(ValueError, match=r"package.module:factory, got 'nothing.here:at_all'"):
+        ReinforceLearner(replace(TINY, policy="nothing.here:at_all"))
 
 
-def test_the_same_weights_may_begin_to_drop_visited_cities_or_cease_to(tmp_path):
+def test_dropping_visited_cities_can_be_switched_on_and_off_with_the_same_weights(tmp_path):
     reinforce(replace(TINY, out=tmp_path, steps=1))
     before = load(tmp_path / "last.safetensors")
     assert before.config.prune_visited
     for prune, expected in ((None, True), (True, True), (False, False)):
-        after = Trainer(replace(TINY, init=str(tmp_path / "last.safetensors"), prune_visited=prune)).network
+        after = ReinforceLearner(replace(TINY, init=str(tmp_path / "last.safetensors"), prune_visited=prune)).network
         assert after.config == replace(before.config, prune_visited=expected)
         assert same(dict(after.state_dict()), dict(before.state_dict()))
     for other in ({}, {"init": "default", "policy": "package.module:factory"}):
-        with pytest.raises(ValueError, match="prune_visited must be None but for a DAN from init, got False"):
+        with pytest.raises(
+            ValueError, match="prune_visited must be None unless a registered policy starts from init, got False"
+        ):
             ReinforceConfig(prune_visited=False, **other)

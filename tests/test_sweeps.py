@@ -7,14 +7,14 @@ from benchmarks.__main__ import main
 from benchmarks.studies import sweeps
 from benchmarks.suite import Cell
 from dan_policy import solve
-from dan_policy.solution import sample_clip
+from dan_policy.heuristics import sampling_clip
 from mtsp_env import uniform
 
 
 def test_the_default_clip_is_that_of_the_size() -> None:
     instance = uniform(np.random.default_rng(0), 30, 3)
     plain = solve(instance, decode="sample", samples=4)
-    assert solve(instance, decode="sample", samples=4, clip=sample_clip(10.0, 30)).tours == plain.tours
+    assert solve(instance, decode="sample", samples=4, clip=sampling_clip(10.0, 30)).tours == plain.tours
     with pytest.raises(ValueError, match=r"clip must be above 0, got 0\.0"):
         solve(instance, decode="sample", clip=0.0)
 

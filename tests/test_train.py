@@ -1,4 +1,4 @@
-"""REINFORCE with a rollout baseline: the gradient is the formula, chunks add up, training helps."""
+"""REINFORCE with a rollout baseline: the gradient is that of the formula, chunks add up, training lowers costs."""
 
 import itertools
 from dataclasses import replace
@@ -13,14 +13,15 @@ from torch import nn
 from torchrl.objectives import ReinforceLoss
 
 from dan_policy import DANConfig, make_actor
+from mtsp_env.instance import Problem
 from train import checkpoint
 from train.__main__ import main
 from train.baseline import RolloutBaseline, SharedBaseline, better
-from train.collect import Instances, costs, draw, draw_set, play, repeat
+from train.collect import costs, draw, draw_set, play, repeat
 from train.config import ReinforceConfig
 from train.loss import EpisodicReinforceLoss, backward, decisions_with_advantage, log_probs, subsample
 from train.presets import PAPER
-from train.reinforce import Trainer, reinforce
+from train.reinforce import ReinforceLearner, reinforce
 
 
 class Preferences(nn.Module):
@@ -45,7 +46,7 @@ def test_the_gradient_is_reinforce_by_hand():
     network = Preferences([0.0, 0.0, 0.0, 0.0])
     nodes = torch.tensor([[0.5, 0.5], [0.1, 0.2], [0.9, 0.3], [0.4, 0.8]], dtype=torch.float64).expand(2, 4, 2)
     config = replace(TINY, n_nodes=(4, 4))
-    episode = play(network, Instances(nodes, 1), config, "sample", keep=True)
+    episode = play(network, Problem(1, {"nodes": nodes}), config, "sample", keep=True)
     episode.decisions["action"].copy_(torch.tensor([[1, 3], [2, 1], [3, 2]]))
     masks = torch.tensor(
         [[[0, 1, 1, 1], [0, 0, 1, 1], [0, 0, 0, 1]], [[0, 1, 1, 1], [0, 1, 1, 0], [0, 0, 1, 0]]]
@@ -67,57 +68,57 @@ def test_padding_after_an_episodes_end_contributes_nothing():
     config = replace(TINY, depot="final", n_nodes=(6, 6), n_agents=(4, 4), batch_size=32)
     network = Preferences([0.5, 0.0, 0.1, 0.2, 0.3, 0.4])
     episode = play(network, draw(np.random.default_rng(0), config, 32), config, "sample", keep=True)
-    assert not episode.valid.all(), "the case has episodes of several lengths"
+    assert not episode.valid.all(), "this case should have episodes of several lengths"
     advantage = torch.randn(32)
     _, whole = gradients(network, decisions_with_advantage(episode, advantage), 32, 1000)
     scrambled = replace(episode, decisions=episode.decisions.clone())
     scrambled.decisions["action"][~episode.valid] = 1
     scrambled.decisions["action_mask"][~episode.valid] = True
-    _, same = gradients(network, decisions_with_advantage(scrambled, advantage), 32, 1000)
+    _, unchanged = gradients(network, decisions_with_advantage(scrambled, advantage), 32, 1000)
     alone = []
     for row in range(32):
         length = int(episode.valid[:, row].sum())
         part = episode.decisions[:length, row].set("advantage", advantage[row].expand(length))
         alone.append(gradients(network, part, 32, 1000)[1][0])
-    assert torch.equal(whole[0], same[0])
+    assert torch.equal(whole[0], unchanged[0])
     assert torch.allclose(whole[0], sum(alone), atol=1e-6)
 
 
 @pytest.fixture(scope="module")
-def trainer():
-    return Trainer(replace(TINY, batch_size=16))
+def learner():
+    return ReinforceLearner(replace(TINY, batch_size=16))
 
 
 @pytest.fixture
-def decisions(trainer):
+def decisions(learner):
     torch.manual_seed(0)
-    instances = draw(np.random.default_rng(0), trainer.config, 16)
-    episode = play(trainer.network, instances, trainer.config, "sample", keep=True)
+    problem = draw(np.random.default_rng(0), learner.config, 16)
+    episode = play(learner.network, problem, learner.config, "sample", keep=True)
     return decisions_with_advantage(episode, torch.randn(16))
 
 
 @pytest.mark.parametrize("chunk", [1, 7, 50])
-def test_chunks_add_up_to_the_whole(trainer, decisions, chunk):
-    loss, whole = gradients(trainer.network, decisions, 16, len(decisions))
-    chunked_loss, chunked = gradients(trainer.network, decisions, 16, chunk)
+def test_chunks_add_up_to_the_whole(learner, decisions, chunk):
+    loss, whole = gradients(learner.network, decisions, 16, len(decisions))
+    chunked_loss, chunked = gradients(learner.network, decisions, 16, chunk)
     assert chunked_loss == pytest.approx(loss, abs=1e-5)
     for a, b in zip(whole, chunked, strict=True):
         assert torch.allclose(a, b, atol=1e-5)
 
 
-def test_a_share_of_the_decisions_estimates_the_gradient_of_all(trainer, decisions, monkeypatch):
-    """Unbiased: averaged over every way to leave one of N out, the estimate is the whole; each is as likely."""
+def test_a_share_of_the_decisions_estimates_the_gradient_of_all(learner, decisions, monkeypatch):
+    """Unbiased: averaged over all equally likely ways to leave one of N out, the estimate is the whole gradient."""
     assert subsample(decisions, 1.0) is decisions
     few = decisions[:12]
-    _, whole = gradients(trainer.network, few, 16, 12)
+    _, whole = gradients(learner.network, few, 16, 12)
     without = []
     for left_out in range(12):
-        order = torch.arange(12).roll(11 - left_out)  # it comes last
+        order = torch.arange(12).roll(11 - left_out)  # the one that is left out comes last
         with monkeypatch.context() as patch:
             patch.setattr(torch, "randperm", lambda n, device, order=order: order)
             part = subsample(few, 11 / 12)
         assert len(part) == 11
-        without.append(gradients(trainer.network, part, 16, 12)[1])
+        without.append(gradients(learner.network, part, 16, 12)[1])
     for each, exact in zip(zip(*without, strict=True), whole, strict=True):
         assert torch.allclose(sum(each) / 12, exact, atol=1e-5)
 
@@ -133,26 +134,26 @@ def test_a_share_of_the_decisions_estimates_the_gradient_of_all(trainer, decisio
     assert len(subsample(decisions, 1e-9)) == 1
 
 
-def test_the_loss_is_torchrls_reinforce_loss_with_another_average(trainer, decisions):
+def test_the_loss_is_torchrls_reinforce_loss_with_another_average(learner, decisions):
     class NoCritic(nn.Module):
         def forward(self, cities):
             return cities.sum((-2, -1))[..., None] * 0
 
     critic = TensorDictModule(NoCritic(), ["cities"], ["state_value"])
-    theirs = ReinforceLoss(make_actor(trainer.network), critic, reduction="sum", functional=False)
+    theirs = ReinforceLoss(make_actor(learner.network), critic, reduction="sum", functional=False)
     batch = decisions.clone().set("value_target", torch.zeros(len(decisions), 1))
     batch["advantage"] = batch["advantage"][:, None]
-    ours = EpisodicReinforceLoss(make_actor(trainer.network), 16)(decisions)["loss_actor"]
+    ours = EpisodicReinforceLoss(make_actor(learner.network), 16)(decisions)["loss_actor"]
     assert torch.allclose(ours, theirs(batch)["loss_actor"] / 16, rtol=1e-5)
-    assert EpisodicReinforceLoss(make_actor(trainer.network), 16).in_keys == [
+    assert EpisodicReinforceLoss(make_actor(learner.network), 16).in_keys == [
         "cities", "agents", "visited", "action_mask", "action", "advantage",
     ]  # fmt: skip
 
 
-def test_recomputed_log_probabilities_are_those_that_were_sampled_from(trainer, decisions):
-    probability = make_actor(trainer.network).get_dist(decisions).probs.gather(1, decisions["action"][:, None])[:, 0]
-    assert torch.allclose(log_probs(make_actor(trainer.network), decisions), probability.log(), atol=1e-5)
-    assert (log_probs(make_actor(trainer.network), decisions) <= 0).all()
+def test_recomputed_log_probabilities_are_those_that_were_sampled_from(learner, decisions):
+    probability = make_actor(learner.network).get_dist(decisions).probs.gather(1, decisions["action"][:, None])[:, 0]
+    assert torch.allclose(log_probs(make_actor(learner.network), decisions), probability.log(), atol=1e-5)
+    assert (log_probs(make_actor(learner.network), decisions) <= 0).all()
 
 
 def test_challenge_is_a_one_sided_paired_t_test():
@@ -171,12 +172,12 @@ def test_the_baseline_changes_only_when_beaten_and_then_draws_a_new_test_set(mon
     good, bad = Preferences([-20.0] + [0.0] * 7), Preferences([20.0] + [0.0] * 7)  # the bad one goes home early
     config = replace(TINY, n_nodes=(8, 8), n_agents=(3, 3), challenge_instances=64)
     baseline = RolloutBaseline(bad, config, rng)
-    instances = draw(rng, config, 10)
+    problem = draw(rng, config, 10)
     zeros = torch.zeros(10)
-    assert torch.equal(baseline.value(instances, zeros), play(bad, instances, config, "greedy").reward)
+    assert torch.equal(baseline.value(problem, zeros), play(bad, problem, config, "greedy").reward)
     first_set = baseline.test_set[0].nodes
     assert baseline.challenge(good) and not torch.equal(baseline.test_set[0].nodes, first_set)
-    assert torch.equal(baseline.value(instances, zeros), play(good, instances, config, "greedy").reward)
+    assert torch.equal(baseline.value(problem, zeros), play(good, problem, config, "greedy").reward)
     second_set = baseline.test_set[0].nodes
     assert not baseline.challenge(bad) and torch.equal(baseline.test_set[0].nodes, second_set)
 
@@ -187,9 +188,9 @@ def test_the_shared_baseline_leaves_each_episode_out():
     assert value.tolist() == [4.0, 3.5, 1.5, -2.5, -2.0, -1.5]
 
 
-def test_the_shared_baseline_is_unbiased_where_including_oneself_would_not_be():
-    """One decision among two, rewards 0 and 1, p = sigmoid(t): the exact gradient of E[R] is p (1 - p). Every outcome
-    of three samples is weighed with its probability."""
+def test_the_shared_baseline_is_unbiased_but_would_not_be_if_it_included_the_sample_itself():
+    """One decision between two actions, rewards 0 and 1, p = sigmoid(t): the exact gradient of E[R] is p (1 - p).
+    The expectation runs over every outcome of three samples."""
     p = 0.3
     with_others = with_itself = 0.0
     for chosen in itertools.product((0, 1), repeat=3):
@@ -205,7 +206,7 @@ def test_the_shared_baseline_is_unbiased_where_including_oneself_would_not_be():
 
 def test_repeated_instances_are_the_same_seen_from_eight_sides():
     nodes = torch.rand(2, 6, 2, dtype=torch.float64)
-    repeated = repeat(Instances(nodes, 2), 9).nodes
+    repeated = repeat(Problem(2, {"nodes": nodes}), 9).nodes
     assert torch.equal(repeated[::9], nodes) and torch.equal(repeated[8::9], nodes)
     assert ((repeated >= 0) & (repeated <= 1)).all()
     lengths = torch.cdist(repeated, repeated)
@@ -215,10 +216,10 @@ def test_repeated_instances_are_the_same_seen_from_eight_sides():
 
 def test_shared_training_goes_through_the_same_step():
     config = replace(TINY, baseline="shared", samples=4, batch_size=5, normalise=True, batch_tokens=21)
-    trainer = Trainer(config)
-    assert isinstance(trainer.baseline, SharedBaseline)
-    logs = trainer.train_step()
-    assert 21 // 8 <= trainer.instances <= 21 // 5 and np.isfinite(logs["grad_norm"])
+    learner = ReinforceLearner(config)
+    assert isinstance(learner.baseline, SharedBaseline)
+    logs = learner.train_step()
+    assert 21 // 8 <= learner.instances <= 21 // 5 and np.isfinite(logs["grad_norm"])
 
 
 def test_a_curriculum_changes_the_ranges_at_its_steps():
@@ -236,21 +237,23 @@ def test_drawn_sizes_cover_their_ranges():
 
 
 def test_the_policy_is_the_running_average_of_the_weights(tmp_path):
-    plain, averaged = (Trainer(replace(TINY, out=tmp_path / str(decay), average=decay)) for decay in (0.0, 0.75))
+    plain, averaged = (
+        ReinforceLearner(replace(TINY, out=tmp_path / str(decay), average=decay)) for decay in (0.0, 0.75)
+    )
     expected: dict[str, torch.Tensor] = {}
     for _ in range(3):
         plain.train_step()
         averaged.train_step()
         for name, weight in averaged.network.state_dict().items():
             expected[name] = 0.75 * expected.get(name, weight) + 0.25 * weight
-    assert same(dict(plain.policy().state_dict()), dict(plain.network.state_dict()))
-    kept = averaged.policy().state_dict()
+    assert same(dict(plain.averaged_network.state_dict()), dict(plain.network.state_dict()))
+    kept = averaged.averaged_network.state_dict()
     assert max(float((kept[name] - weight).abs().max()) for name, weight in expected.items()) < 1e-6
     assert not same(dict(kept), dict(averaged.network.state_dict()))
 
 
 def test_training_lowers_the_greedy_cost_on_held_out_instances(tmp_path):
-    """A minute of training in small: 200 steps at n = 10, m = 2."""
+    """200 steps at n = 10, m = 2."""
     config = replace(
         TINY, out=tmp_path, n_nodes=(10, 10), n_agents=(2, 2), batch_size=64, steps=200, seed=1,
         learning_rate=1e-3, decay_every=1000,
@@ -258,7 +261,7 @@ def test_training_lowers_the_greedy_cost_on_held_out_instances(tmp_path):
         challenge_every=20, challenge_instances=128, validate_every=1000, checkpoint_every=1000,
     )  # fmt: skip
     held_out = draw_set(np.random.default_rng(77), config, 256)
-    before = costs(Trainer(config).network, held_out, config)
+    before = costs(ReinforceLearner(config).network, held_out, config)
     after = costs(reinforce(config).network, held_out, config)
     assert better(after, before, 1e-6)
     assert after.mean() < 0.65 * before.mean()  # 0.57; the nearest city: 0.60
@@ -273,6 +276,9 @@ def test_training_lowers_the_greedy_cost_on_held_out_instances(tmp_path):
         ({"learning_rate": 0.0}, "learning_rate must be above 0"),
         ({"decisions": 0.0}, "decisions must be above 0 and at most 1, got 0.0"),
         ({"challenge_p": 1.0}, "challenge_p must lie between 0 and 1"),
+        ({"seconds": -1.0}, "seconds must be .*, got -1.0"),
+        ({"policy": "nobody"}, r"policy must be package.module:factory or one of \['dan'.*\], got 'nobody'"),
+        ({"policy_options": {"layers": 2}}, "policy_options must be empty for the policy 'dan'"),
         ({"distribution": "normal"}, "unknown distribution 'normal'"),
         ({"baseline": "shared"}, "samples must be a whole number of at least 2, got 1"),
         ({"curriculum": ((0, 9, 8, 1, 2),)}, r"n_nodes\[1\] must be a whole number of at least 9, got 8"),
@@ -296,16 +302,16 @@ def test_the_command_line_trains_and_reports_bad_input(tmp_path, capsys):
              "--validation-instances", "4", "--out", str(tmp_path), "--no-tensorboard"]  # fmt: skip
     assert main(["reinforce", "quick", "--steps", "2", *small]) == 0
     assert main(["reinforce", "quick", "--steps", "2", *small]) == 2
-    assert "give --resume" in capsys.readouterr().err
+    assert "add --resume" in capsys.readouterr().err
     assert main(["reinforce", "quick", "--steps", "3", "--resume", *small]) == 0
     assert checkpoint.read(tmp_path / "checkpoint.pt")["progress"]["step"] == 3
 
 
 def test_precision_is_a_setting():
     config = replace(TINY, precision="bfloat16")
-    trainer = Trainer(config)
-    logs = trainer.train_step()
+    learner = ReinforceLearner(config)
+    logs = learner.train_step()
     assert np.isfinite(logs["grad_norm"]) and logs["grad_norm"] > 0
-    instances = Instances(torch.rand(4, 6, 2, dtype=torch.float64), 2)
-    wide = play(trainer.network, instances, replace(config, precision="float32"), "greedy").reward
+    problem = Problem(2, {"nodes": torch.rand(4, 6, 2, dtype=torch.float64)})
+    wide = play(learner.network, problem, replace(config, precision="float32"), "greedy").reward
     assert wide.dtype == torch.float32

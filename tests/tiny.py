@@ -1,4 +1,4 @@
-"""A training run that takes a second."""
+"""The options of a training run that takes a second."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Baselines, b in the advantage R - b: the best policy so far, or the other samples of the same instance."""
+"""Baselines b of the advantage R - b: the best policy so far, or the other samples of the same instance."""
 
 from __future__ import annotations
 
@@ -9,22 +9,23 @@ import numpy as np
 from scipy.stats import ttest_rel
 from torch import Tensor, nn
 
-from train.collect import Instances, costs, draw_set, play
+from mtsp_env.instance import Problem
+from train.collect import costs, draw_set, play
 from train.config import ReinforceConfig
 from train.distributed import gather
 
 
 class Baseline(Protocol):
-    """What a trainer asks of one."""
+    """The methods that ``ReinforceLearner`` calls."""
 
-    def value(self, instances: Instances, reward: Tensor) -> Tensor:
-        """(B,) What each episode's reward (B,) is compared with. Must not depend on that episode's actions."""
+    def value(self, problem: Problem, reward: Tensor) -> Tensor:
+        """(B,) The value that each episode's reward (B,) is compared with, independent of that episode's actions."""
 
     def challenge(self, network: nn.Module) -> bool:
-        """Offer it a better policy; whether it took that."""
+        """Replace the baseline's policy by ``network`` if that is better. Returns whether it did."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything but the random generator, which belongs to the trainer."""
+        """Everything but the random generator, which belongs to the learner."""
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what ``state_dict`` returned."""
@@ -33,19 +34,20 @@ class Baseline(Protocol):
 class SharedBaseline:
     """The mean reward of the other samples of the same instance (Kool et al. 2019b; Kwon et al. 2020).
 
-    Episodes i * K to i * K + K - 1 are the samples of one instance. Leaving out its own keeps the gradient unbiased.
+    Episodes i * K to i * K + K - 1 are the samples of one instance. Because an episode's own reward is left out, the
+    gradient is unbiased.
     """
 
     def __init__(self, samples: int):
         self.samples = samples
 
-    def value(self, instances: Instances, reward: Tensor) -> Tensor:
-        """(B,) The mean of the K - 1 others."""
+    def value(self, problem: Problem, reward: Tensor) -> Tensor:
+        """(B,) The mean reward of the K - 1 other samples."""
         rewards = reward.view(-1, self.samples)
         return ((rewards.sum(1, keepdim=True) - rewards) / (self.samples - 1)).flatten()
 
     def challenge(self, network: nn.Module) -> bool:
-        """There is no policy to replace."""
+        """Do nothing: there is no policy to replace."""
         return False
 
     def state_dict(self) -> dict[str, Any]:
@@ -53,7 +55,7 @@ class SharedBaseline:
         return {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Nothing."""
+        """Do nothing."""
 
 
 class RolloutBaseline:
@@ -61,49 +63,48 @@ class RolloutBaseline:
 
     def __init__(self, network: nn.Module, config: ReinforceConfig, rng: np.random.Generator):
         self.config, self.rng = config, rng
-        self._crown(network)
+        self._adopt(network)
 
-    def value(self, instances: Instances, reward: Tensor) -> Tensor:
-        """(B,) The reward that the best policy so far gets on each instance."""
-        return play(self.network, instances, self.config, "greedy").reward
+    def value(self, problem: Problem, reward: Tensor) -> Tensor:
+        """(B,) The reward of the best policy so far on each instance."""
+        return play(self.network, problem, self.config, "greedy").reward
 
     def challenge(self, network: nn.Module) -> bool:
-        """Let ``network`` take over if it is better on the test set: lower mean, one-sided paired t-test.
+        """Replace the baseline if ``network`` has a lower mean cost on the test set (one-sided paired t-test).
 
-        The test set is drawn afresh whenever the baseline changes, so that it is never overfitted.
+        A new test set is drawn whenever the baseline changes, so that no policy overfits it.
         """
         cost = costs(network, self.test_set, self.config)
         won = better(gather(cost), gather(self.test_costs), self.config.challenge_p)
         if won:
-            self._crown(network)
+            self._adopt(network)
         return won
 
-    def _crown(self, network: nn.Module) -> None:
+    def _adopt(self, network: nn.Module) -> None:
         self.network = copy.deepcopy(network).eval().requires_grad_(False)
         self.test_set = draw_set(self.rng, self.config, self.config.challenge_instances)
         self.test_costs = costs(self.network, self.test_set, self.config)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything but the random generator, which belongs to the trainer."""
+        """Everything but the random generator, which belongs to the learner."""
         return {
             "network": self.network.state_dict(),
-            "test_nodes": [part.nodes for part in self.test_set],
-            "test_agents": [part.n_agents for part in self.test_set],
+            "test_set": [{"n_agents": part.n_agents, "arrays": dict(part.arrays)} for part in self.test_set],
             "test_costs": self.test_costs,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what ``state_dict`` returned."""
         self.network.load_state_dict(state["network"])
-        self.test_set = [Instances(*part) for part in zip(state["test_nodes"], state["test_agents"], strict=True)]
+        self.test_set = [Problem(**part) for part in state["test_set"]]
         self.test_costs = state["test_costs"]
 
 
 def better(cost: Tensor, than: Tensor, p: float) -> bool:
-    """Whether paired costs (N,) are lower than others, by a one-sided paired t-test at level ``p``."""
+    """Whether costs (N,) are lower than others on the same instances, by a one-sided paired t-test at level ``p``."""
     difference = (cost - than).double().cpu().numpy()
     if not (difference.mean() < 0):
         return False
     if np.ptp(difference) == 0:
-        return True  # lower by the same amount everywhere: no doubt left, and the test would divide by 0
+        return True  # lower by the same amount everywhere: certain, and the test would divide by 0
     return bool(ttest_rel(cost.cpu().numpy(), than.cpu().numpy(), alternative="less").pvalue < p)

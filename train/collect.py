@@ -3,33 +3,26 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torchrl.modules import ProbabilisticActor
 
-from dan_policy.actor import OBSERVATION, make_actor
+from dan_policy.actor import as_actor
 from dan_policy.episode import Decode, Episode, rollout
 from dan_policy.symmetry import views
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.distributions import sample
+from mtsp_env.instance import Problem
+from mtsp_env.rules import Depot
 from train.config import RunConfig
-
-
-class Instances(NamedTuple):
-    """A batch of instances of one size."""
-
-    nodes: Tensor  # (B, n, 2) float64
-    n_agents: int
 
 
 def draw_size(rng: np.random.Generator, config: RunConfig) -> tuple[int, int]:
     """n and m, uniform in their ranges."""
     n_nodes = int(rng.integers(*config.n_nodes, endpoint=True))
-    most = max(config.n_agents[0], min(config.n_agents[1], n_nodes // config.nodes_per_agent))
-    return n_nodes, int(rng.integers(config.n_agents[0], most, endpoint=True))
+    greatest = max(config.n_agents[0], min(config.n_agents[1], n_nodes // config.nodes_per_agent))
+    return n_nodes, int(rng.integers(config.n_agents[0], greatest, endpoint=True))
 
 
 def draw(
@@ -38,58 +31,65 @@ def draw(
     batch: int,
     tokens: int | None = None,
     size: tuple[int, int] | None = None,
-) -> Instances:
-    """``batch`` fresh instances, fewer where they would hold more than ``tokens`` nodes; one n and m for all.
+) -> Problem:
+    """A problem of fresh instances, torch tensors on the run's device.
 
-    ``size`` gives n and m; None draws them.
+    Args:
+        batch: number of instances.
+        tokens: upper bound on instances times nodes, which may reduce their number to no less than 1; None: no bound.
+        size: n and m; None draws them.
     """
     n_nodes, n_agents = size or draw_size(rng, config)
     batch = batch if tokens is None else max(1, min(batch, tokens // n_nodes))
-    problem = sample(config.distribution, rng, batch, n_nodes, n_agents)
-    return Instances(torch.as_tensor(problem.nodes, device=config.device), n_agents)
+    arrays = sample(config.generator(), rng, batch, n_nodes, n_agents).arrays
+    return Problem(n_agents, {name: torch.as_tensor(array, device=config.device) for name, array in arrays.items()})
 
 
-def repeat(instances: Instances, samples: int) -> Instances:
-    """Each instance ``samples`` times in a row, in another of the square's eight symmetries each time."""
+def repeat(problem: Problem, samples: int) -> Problem:
+    """Each instance ``samples`` times in succession, going through the eight symmetries of the square."""
     if samples == 1:
-        return instances
-    return Instances(views(instances.nodes, samples).flatten(0, 1), instances.n_agents)
+        return problem
+    repeated = {name: array.repeat_interleave(samples, 0) for name, array in problem.arrays.items()}
+    return Problem(problem.n_agents, repeated | {"nodes": views(problem.nodes, samples).flatten(0, 1)})
 
 
-def draw_set(rng: np.random.Generator, config: RunConfig, count: int, sizes: int = 8) -> list[Instances]:
-    """``count`` instances in about ``sizes`` batches, each of its own n and m: a set to compare policies on."""
+def draw_set(rng: np.random.Generator, config: RunConfig, count: int, sizes: int = 8) -> list[Problem]:
+    """``count`` instances to compare policies on, in at most ``sizes`` batches, each with its own n and m."""
     counts = [len(part) for part in np.array_split(np.arange(count), min(sizes, count))]
     return [draw(rng, config, part) for part in counts]
 
 
-def play(policy: nn.Module, instances: Instances, config: RunConfig, decode: Decode, keep: bool = False) -> Episode:
-    """Whole episodes of a network, or of its actor, one per instance; ``keep`` the decisions, to learn from them.
+def play(policy: nn.Module, problem: Problem, config: RunConfig, decode: Decode, keep: bool = False) -> Episode:
+    """Play whole episodes, one per instance. The only place where training meets the environment in one process.
 
-    The one place where training meets the environment: in one process, with ``rollout``.
+    Args:
+        policy: a network, or its actor.
+        keep: keep each decision's action and what the policy read, so that it can be evaluated again.
     """
-    batch, n_nodes = instances.nodes.shape[:2]
-    env = environment(n_nodes, instances.n_agents, batch, config)
+    actor = as_actor(policy)
+    env = environment(problem, config)
+    keys = tuple(dict.fromkeys(actor.in_keys)) if keep else ()
     with autocast(config):
-        kept = (*OBSERVATION, "action_mask") if keep else ()
-        actor = policy if isinstance(policy, ProbabilisticActor) else make_actor(policy)
-        return rollout(actor, env, decode, instances.nodes, kept)
+        return rollout(actor, env, decode, problem, keys)
 
 
-def costs(network: nn.Module, instances: list[Instances], config: RunConfig) -> Tensor:
-    """(sum of B,) Greedy cost of every instance."""
-    return torch.cat([-play(network, part, config, "greedy").reward for part in instances])
+def costs(policy: nn.Module, problems: list[Problem], config: RunConfig) -> Tensor:
+    """(sum of B,) Greedy cost (the makespan, or the penalty of a truncated episode) of every instance."""
+    return torch.cat([-play(policy, part, config, "greedy").reward for part in problems])
 
 
-def environment(n_nodes: int, n_agents: int, batch: int, config: RunConfig) -> BatchedMTSP:
-    """The run's environment for a batch of one size; they are kept, because building their specs takes milliseconds."""
-    return _environment(n_nodes, n_agents, batch, config.speed, config.depot, config.device)
+def environment(problem: Problem, config: RunConfig) -> BatchedMTSP:
+    """The run's environment for a batch of that size. Environments are reused: building their specs is slow."""
+    return _environment(
+        problem.n_nodes, problem.n_agents, len(problem.nodes), config.speed, config.depot, config.device
+    )
 
 
 @lru_cache(maxsize=1024)
-def _environment(n_nodes: int, n_agents: int, batch: int, speed: float, depot: str, device: str) -> BatchedMTSP:
-    return BatchedMTSP(n_nodes, n_agents, [batch], speed, depot, device=device, check_actions=False)
+def _environment(n_nodes: int, n_agents: int, batch: int, speed: float, depot: Depot, device: str) -> BatchedMTSP:
+    return BatchedMTSP(n_nodes, n_agents, batch, speed, depot, device=device, check_actions=False)
 
 
 def autocast(config: RunConfig) -> torch.autocast:
-    """The run's precision, as a context."""
+    """A context with the run's precision."""
     return torch.autocast(torch.device(config.device).type, torch.bfloat16, enabled=config.precision == "bfloat16")

@@ -3,82 +3,82 @@
 from __future__ import annotations
 
 import json
+import pkgutil
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from dan_policy.network import DANConfig
-from mtsp_env.checks import check_count
-from mtsp_env.distributions import check_distribution
-
-# May differ between a run and its continuation; everything else is part of what is being trained.
-FREE_ON_RESUME = (
-    "out",
-    "resume",
-    "steps",
-    "seconds",
-    "threads",
-    "tensorboard",
-    "checkpoint_every",
-    "device",
-    "workers",
-)
+from dan_policy.dan import DANConfig
+from dan_policy.registry import NETWORKS
+from mtsp_env.checks import check_count, check_seconds
+from mtsp_env.distributions import Generator, check_distribution
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig:
     """What every kind of training has: where it writes, what it trains, on which instances, when it validates.
 
+    The options of a registered network stand in a field of their own whose type is the network's configuration
+    (``network`` for "dan"); to add another network's, add one field.
+
     Raises:
         ValueError: a value outside its range.
     """
 
     out: Path = Path("runs/train")
-    """Folder for checkpoint, weights and logs."""
+    """Folder for the checkpoint, weights and logs."""
     resume: bool = False
-    """Go on from the checkpoint in `out`, bit by bit as if the run had never stopped."""
+    """Continue from the checkpoint in `out`, bit for bit as if the run had never stopped."""
     seed: int = 0
+    """Seed of the weights, the instances and the sampled actions."""
     steps: int = 100_000
-    """Optimiser steps in all."""
+    """Total number of optimiser steps."""
     seconds: float | None = None
-    """Stop (and save) after so many more seconds of training and validation, whatever `steps` says."""
+    """Stop and save after this many more seconds of training and validation, even before `steps` are reached."""
 
     n_nodes: tuple[int, int] = (20, 100)
-    """Range of n, the depot included; drawn once per batch."""
+    """Range of n, the depot included. Each batch draws one n."""
     n_agents: tuple[int, int] = (5, 10)
-    """Range of m; drawn once per batch."""
+    """Range of m. Each batch draws one m."""
     nodes_per_agent: int = 1
-    """At least so many nodes for each agent: the upper end of m's range falls with n."""
+    """Least number of nodes per agent: it lowers the upper end of m's range for small n."""
     distribution: str = "uniform"
+    """How instances are drawn: uniform, clustered, or package.module:function for a generator of your own."""
     speed: float = 0.1
     """Distance per tick, the paper's Delta g."""
     depot: Literal["open", "final"] = "open"
-    """Whether an agent that is back at the depot may leave again."""
+    """Whether an agent that has returned to the depot may leave it again (open) or has finished (final)."""
 
+    policy: str = "dan"
+    """The network to train: a registered name, or package.module:factory. The working directory is importable."""
+    policy_options: dict[str, int | float | bool | str] = field(default_factory=dict, hash=False)
+    """Keyword arguments of the factory: NAME VALUE NAME VALUE ..."""
     network: DANConfig = field(default_factory=DANConfig.paper)
-    policy: str | None = None
-    """A network of your own instead of a DAN: package.module:factory, called without arguments."""
+    """Options of the policy dan."""
     init: str | None = None
-    """Weights to start from: a file, or the name of a shipped model (its configuration replaces `network`)."""
+    """Weights to start from: a file, or the name of a shipped model. A registered network takes its options from it."""
     prune_visited: bool | None = None
-    """Whether the DAN of `init` drops visited cities before its encoders from now on, with the same weights. None: as
-    its file says."""
+    """With `init`: override whether the network drops visited cities before its encoders. Its weights stay the same."""
     max_grad_norm: float = 1.0
+    """Gradients are scaled down to this norm if theirs is larger."""
     average: float = 0.0
-    """Decay of the running average of the weights, which is what is validated and saved. 0: the weights as they are."""
+    """Decay of the running average of the weights, which is what is validated and saved. 0 disables averaging."""
 
     validation_instances: int = 256
-    """Held-out instances (the same in every run) for the reported cost and for `best.safetensors`."""
+    """Number of held-out instances (the same in every run) for the reported cost and for `best.safetensors`."""
     validate_every: int = 128
+    """Steps between validations."""
     checkpoint_every: int = 128
+    """Steps between checkpoints."""
 
     precision: Literal["float32", "bfloat16"] = "float32"
-    """bfloat16 autocast pays on GPUs and on CPUs with AMX or AVX-512 BF16."""
+    """bfloat16 autocast is faster on GPUs and on CPUs with AMX or AVX-512 BF16."""
     device: str = "cpu"
+    """cpu, cuda, cuda:1, ..."""
     threads: int | None = None
-    """CPU threads of PyTorch; none: PyTorch's own choice."""
+    """Number of CPU threads that PyTorch uses. None: PyTorch's default."""
     tensorboard: bool = True
-    """TensorBoard logs beside the CSV ones."""
+    """Write TensorBoard logs as well as CSV files."""
 
     def __post_init__(self) -> None:
         for name, minimum in (("n_nodes", 2), ("n_agents", 1)):
@@ -88,8 +88,9 @@ class RunConfig:
         self._check_at_least(1, "steps", "nodes_per_agent", "validate_every", "checkpoint_every")
         self._check_at_least(2, "validation_instances")
         self._check_positive("max_grad_norm", "speed")
-        if self.prune_visited is not None and (self.init is None or self.policy is not None):
-            raise ValueError(f"prune_visited must be None but for a DAN from init, got {self.prune_visited}")
+        if self.seconds is not None:
+            check_seconds("seconds", self.seconds)
+        self._check_policy()
         if not 0 <= self.average < 1:
             raise ValueError(f"average must be at least 0 and below 1, got {self.average!r}")
         if self.n_agents[0] * self.nodes_per_agent > self.n_nodes[0]:
@@ -97,7 +98,17 @@ class RunConfig:
                 f"nodes_per_agent must be at most n_nodes[0] // n_agents[0] = {self.n_nodes[0] // self.n_agents[0]}, "
                 f"got {self.nodes_per_agent}"
             )
-        check_distribution(self.distribution)
+        check_distribution(self.generator())
+
+    def _check_policy(self) -> None:
+        if not self.registered and ":" not in self.policy:
+            raise ValueError(f"policy must be package.module:factory or one of {sorted(NETWORKS)}, got {self.policy!r}")
+        if self.registered and self.policy_options:
+            raise ValueError(f"policy_options must be empty for the policy {self.policy!r}, got {self.policy_options}")
+        if self.prune_visited is not None and (self.init is None or not self.registered):
+            raise ValueError(
+                f"prune_visited must be None unless a registered policy starts from init, got {self.prune_visited}"
+            )
 
     def _check_at_least(self, minimum: int, *names: str) -> None:
         for name in names:
@@ -108,7 +119,32 @@ class RunConfig:
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be above 0, got {getattr(self, name)!r}")
 
-    def to_dict(self) -> dict:
+    @property
+    def registered(self) -> bool:
+        """Whether ``policy`` is a registered name rather than a factory."""
+        return self.policy in NETWORKS
+
+    def network_options(self) -> dict[str, Any]:
+        """The registered network's configuration, or the factory's keyword arguments."""
+        if not self.registered:
+            return dict(self.policy_options)
+        options = {type(value): value for value in vars(self).values()}
+        return asdict(options[NETWORKS[self.policy].config])
+
+    def generator(self) -> str | Generator:
+        """The name of a distribution, or the function that ``package.module:function`` names.
+
+        Raises:
+            ValueError: there is no such function.
+        """
+        if ":" not in self.distribution:
+            return self.distribution
+        try:
+            return pkgutil.resolve_name(self.distribution)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise ValueError(f"distribution={self.distribution!r} cannot be imported ({error})") from error
+
+    def to_dict(self) -> dict[str, Any]:
         """The configuration as JSON values."""
         return json.loads(json.dumps(asdict(self), default=str))
 
@@ -122,43 +158,45 @@ class ReinforceConfig(RunConfig):
     """
 
     out: Path = Path("runs/reinforce")
-    """Folder for checkpoint, weights and logs."""
+    """Folder for the checkpoint, weights and logs."""
     batch_size: int = 8
-    """Instances per optimiser step, for each process."""
+    """Number of instances per optimiser step and process."""
     batch_tokens: int | None = None
-    """Instances times nodes per optimiser step, at most: larger instances come in smaller batches. None: no bound."""
+    """Upper bound on instances times nodes per optimiser step: larger instances come in smaller batches."""
     curriculum: tuple[tuple[int, int, int, int, int], ...] = ()
-    """Later ranges: from step, least n, greatest n, least m, greatest m. Five numbers for each stage."""
+    """Later ranges, five numbers per stage: first step, least n, greatest n, least m, greatest m."""
 
     collector: Literal["here", "ray"] = "here"
-    """here: this process plays the episodes. ray: Ray workers do, on this machine or on a cluster (RAY_ADDRESS)."""
+    """Who plays the episodes: this process (here), or Ray workers on this machine or a cluster (RAY_ADDRESS)."""
     ray_workers: int = 2
-    """Ray: how many, each playing `batch_size` instances for every optimiser step."""
+    """Number of Ray workers. Each plays `batch_size` instances per optimiser step."""
 
     baseline: Literal["rollout", "shared"] = "rollout"
-    """rollout: the best policy so far, greedily (the paper). shared: the other samples of the same instance."""
+    """rollout: the best policy so far, played greedily (the paper). shared: the other samples of the same instance."""
     samples: int = 1
-    """Episodes of each instance; for `shared` at least 2, each seen in another rotation or reflection."""
+    """Episodes per instance, each in another rotation or reflection. `shared` needs at least 2."""
     normalise: bool = False
     """Divide advantages by their standard deviation over the batch."""
 
     learning_rate: float = 1e-5
+    """Adam's, at the beginning."""
     decay: float = 0.96
     """Factor on the learning rate every `decay_every` steps."""
     decay_every: int = 1024
+    """Steps between two decays of the learning rate."""
 
     challenge_every: int = 128
     """Steps between challenges of the baseline."""
     challenge_instances: int = 512
-    """Fresh instances that the baseline is tested on."""
+    """Number of fresh instances on which a challenge compares the policy with the baseline."""
     challenge_p: float = 0.05
-    """One-sided paired t-test: the policy replaces the baseline below this p."""
+    """The policy replaces the baseline if a one-sided paired t-test gives a p below this."""
 
     decisions: float = 1.0
-    """Share of a batch's decisions that its gradient is estimated from, drawn at random. Fewer make a step shorter, and
-    its gradient noisier: the variance is up to one over the share of what all of them would give."""
+    """Share of a batch's decisions, drawn at random, that the gradient is estimated from. A smaller share makes steps
+    shorter and gradients noisier: their variance grows at most in inverse proportion to the share."""
     chunk: int = 512
-    """Decisions whose log-probabilities are recomputed at once: the bound on memory."""
+    """Number of decisions whose log-probabilities are computed at once. It bounds the memory."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -168,105 +206,99 @@ class ReinforceConfig(RunConfig):
         self._check_positive("learning_rate", "decay")
         if self.batch_tokens is not None:
             self._check_at_least(1, "batch_tokens")
-        for first, *ranges in self.curriculum:
-            check_count("curriculum: from step", first, 0)
-            replace(self, curriculum=(), n_nodes=tuple(ranges[:2]), n_agents=tuple(ranges[2:]))
+        for stage in self.curriculum:
+            check_count("curriculum: first step", stage[0], 0)
+            self._at_stage(stage)  # which checks the ranges
         if not 0 < self.decisions <= 1:
             raise ValueError(f"decisions must be above 0 and at most 1, got {self.decisions!r}")
         if not 0 < self.challenge_p < 1:
             raise ValueError(f"challenge_p must lie between 0 and 1, got {self.challenge_p!r}")
 
     def at(self, step: int) -> ReinforceConfig:
-        """The configuration with the ranges that hold at ``step``."""
-        begun = [ranges for first, *ranges in self.curriculum if first <= step]
-        if not begun:
-            return self
-        return replace(self, curriculum=(), n_nodes=tuple(begun[-1][:2]), n_agents=tuple(begun[-1][2:]))
+        """The configuration with the ranges of the curriculum's stage at ``step``."""
+        begun = [stage for stage in self.curriculum if stage[0] <= step]
+        return self._at_stage(begun[-1]) if begun else self
+
+    def _at_stage(self, stage: tuple[int, int, int, int, int]) -> ReinforceConfig:
+        _, least_n, greatest_n, least_m, greatest_m = stage
+        return replace(self, curriculum=(), n_nodes=(least_n, greatest_n), n_agents=(least_m, greatest_m))
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImitateConfig(RunConfig):
-    """Imitation of the reference solver: a warm start for REINFORCE, or a policy of its own.
+    """Imitation of the reference solver: a warm start for REINFORCE, or a policy in its own right.
 
-    A *set* is a batch of instances of one (n, m) with the teacher's tours; a *row* is all of a set's decisions at one
-    index, rectangular after pruning. An optimiser step takes `rows` rows of as many sets, chosen at random among
-    `buffer` sets, so that it mixes sizes and phases of the game.
+    A *set* is a batch of instances of one size (n, m) with the teacher's tours. Its k-th decisions form a rectangular
+    batch even if visited cities are dropped. An optimiser step takes such a batch from each of `sets_per_step` sets,
+    drawn at random from the `buffer` sets at hand, so that it mixes sizes and phases of the game.
 
     Raises:
         ValueError: a value outside its range.
     """
 
     out: Path = Path("runs/imitate")
-    """Folder for checkpoint, weights and logs."""
+    """Folder for the checkpoint, weights and logs."""
     steps: int = 20_000
-    """Optimiser steps in all; the learning rate reaches its end with them."""
+    """Total number of optimiser steps. The learning rate reaches its final value with the last one."""
     n_nodes: tuple[int, int] = (20, 200)
-    """Range of n, the depot included; drawn once per set."""
+    """Range of n, the depot included. Each set draws one n."""
     n_agents: tuple[int, int] = (2, 20)
-    """Range of m; drawn once per set."""
+    """Range of m. Each set draws one m."""
     nodes_per_agent: int = 5
-    """At least so many nodes for each agent: the upper end of m's range falls with n."""
+    """Least number of nodes per agent: it lowers the upper end of m's range for small n."""
     speed: float = 0.01
     """Distance per tick, the paper's Delta g (in its tests)."""
     depot: Literal["final"] = "final"
-    """Whether an agent that is back at the depot may leave again: the teacher's never do."""
+    """An agent that has returned to the depot has finished: the teacher's agents never leave twice."""
     network: DANConfig = field(default_factory=lambda: DANConfig(prune_visited=True))
+    """Options of the policy dan."""
 
     set_tokens: int = 8192
-    """Instances times nodes of a set, at most: it has the greatest power of two that allows, between 16 and 256."""
+    """Upper bound on instances times nodes of a set. The number of instances is a power of two from 16 to 256."""
     buffer: int = 16
-    """Sets that are learnt from at a time."""
+    """Number of sets to draw from at a time."""
     passes: float = 1.0
-    """Share of a set's decision indices that are learnt from before it gives way to a fresh one, at most 1."""
+    """Share of a set's decision indices that are used before a fresh set replaces it, at most 1."""
     roll_in: str | None = None
-    """Weights of a student, a file or a shipped model's name, that plays the beginning of each game, for a random
-    number of decisions; the teacher shows how to go on from there (DAgger), and the next decisions are learnt from, the
-    share `passes` of a set's. None: the teacher plays all of it."""
-    rows: int = 4
-    """Rows per optimiser step."""
+    """Weights of a student (a file, or a shipped model's name) that plays a random number of decisions at the beginning
+    of each game; the teacher shows how to continue (DAgger), and the next decisions are learnt from, a share `passes`
+    of the set's. None: the teacher plays whole games."""
+    sets_per_step: int = 4
+    """Number of sets that an optimiser step takes decisions from."""
     teacher_iterations: int = 80
-    """Iterations of the reference solver for each node of an instance."""
+    """Iterations of the reference solver per node of an instance."""
     workers: int = 1
-    """Processes that make sets while the network learns; 0: the learning process makes them itself, in between."""
+    """Processes that prepare sets while the network learns. 0: the learning process prepares them itself."""
 
     learning_rate: float = 5e-4
-    """Peak, after a linear warm-up; falls along half a cosine to `final_rate` of it."""
+    """Peak of AdamW's learning rate, after a linear warm-up; then it falls along half a cosine."""
     final_rate: float = 0.02
+    """Final learning rate as a share of the peak."""
     warmup: int = 200
     """Steps of the warm-up."""
     weight_decay: float = 0.01
-    """AdamW's."""
+    """AdamW's weight decay."""
     average: float = 0.999
+    """Decay of the running average of the weights, which is what is validated and saved. 0 disables averaging."""
     validate_every: int = 500
+    """Steps between validations."""
     checkpoint_every: int = 500
+    """Steps between checkpoints."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check_at_least(1, "set_tokens", "buffer", "rows", "teacher_iterations", "warmup")
+        self._check_at_least(1, "set_tokens", "buffer", "sets_per_step", "teacher_iterations", "warmup")
         self._check_at_least(0, "workers")
         self._check_positive("learning_rate")
         if self.depot != "final":
             raise ValueError(f"depot must be 'final' (the teacher's agents never leave twice), got {self.depot!r}")
         if self.n_nodes[0] <= self.n_agents[0]:
             raise ValueError(f"n_nodes[0] must be above n_agents[0]={self.n_agents[0]}, got {self.n_nodes[0]}")
-        if self.rows > self.buffer:
-            raise ValueError(f"rows must be at most buffer={self.buffer}, got {self.rows}")
+        if self.sets_per_step > self.buffer:
+            raise ValueError(f"sets_per_step must be at most buffer={self.buffer}, got {self.sets_per_step}")
         if not 0 < self.passes <= 1:
             raise ValueError(f"passes must be above 0 and at most 1, got {self.passes!r}")
         if not 0 < self.final_rate <= 1:
             raise ValueError(f"final_rate must be above 0 and at most 1, got {self.final_rate!r}")
         if not self.weight_decay >= 0:
             raise ValueError(f"weight_decay must be at least 0, got {self.weight_decay!r}")
-
-
-def check_same_run(old: dict, config: RunConfig) -> None:
-    """Raise ValueError where ``config`` would change what an interrupted run was training.
-
-    Options that are younger than its checkpoint had their default.
-    """
-    new, default = config.to_dict(), type(config)().to_dict()
-    old = default | old | {"network": asdict(DANConfig()) | old["network"]}
-    changed = [k for k in new if k not in FREE_ON_RESUME and old[k] != new[k]]
-    if changed:
-        said = ", ".join(f"{k} was {old[k]!r}, is {new[k]!r}" for k in changed)
-        raise ValueError(f"a resumed run keeps its configuration: {said}")

@@ -1,6 +1,6 @@
-"""Several processes, one training: what ``torchrun`` starts, each drawing its own batches (gloo on CPUs, NCCL on GPUs).
+"""Several processes, one training: what ``torchrun`` starts, each with its own batches (gloo on CPUs, NCCL on GPUs).
 
-Alone, without ``torchrun``, every function here is the identity.
+In a single process, without ``torchrun``, every function here is the identity.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 @contextmanager
 def processes(device: str) -> Iterator[None]:
-    """Join the group that ``torchrun`` describes in the environment; leave it at the end."""
+    """Join the group that ``torchrun`` describes in the environment variables; leave it at the end."""
     if int(os.environ.get("WORLD_SIZE", "1")) == 1 or dist.is_initialized():
         yield
         return
@@ -30,20 +30,20 @@ def processes(device: str) -> Iterator[None]:
 
 
 def rank() -> int:
-    """This process's number; 0 writes logs and weights."""
+    """This process's number. Process 0 writes logs and weights."""
     return dist.get_rank() if dist.is_initialized() else 0
 
 
 def world_size() -> int:
-    """How many processes train together."""
+    """The number of processes that train together."""
     return dist.get_world_size() if dist.is_initialized() else 1
 
 
 def average_gradients(network: nn.Module) -> None:
     """Replace every gradient by its mean over the processes, in one message.
 
-    With losses that are means over equally many episodes, that is the gradient of one process with all of them. (The
-    backward pass goes in chunks, whose number differs between processes, so there is nothing to overlap with.)
+    If the processes' losses are means over equally many episodes, that is the gradient of one process with all of them.
+    (The backward pass runs in chunks, whose number differs between processes, so communication cannot overlap with it.)
     """
     if world_size() == 1:
         return
@@ -56,7 +56,7 @@ def average_gradients(network: nn.Module) -> None:
 
 
 def gather(values: Tensor) -> Tensor:
-    """(K * N,) Everybody's values (N,), the same order everywhere."""
+    """(K * N,) The values (N,) of all K processes, in the same order in each of them."""
     if world_size() == 1:
         return values
     parts = [torch.empty_like(values) for _ in range(world_size())]
@@ -64,8 +64,8 @@ def gather(values: Tensor) -> Tensor:
     return torch.cat(parts)
 
 
-def anyone(flag: bool, device: str) -> bool:
-    """Whether any process says so: all of them end a run after the same step."""
+def any_process(flag: bool, device: str) -> bool:
+    """Whether ``flag`` is set in any process, so that all of them end a run after the same step."""
     if world_size() == 1:
         return flag
     votes = torch.tensor([float(flag)], device=device)

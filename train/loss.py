@@ -1,4 +1,4 @@
-"""The REINFORCE loss over whole episodes, recomputed in chunks so that memory does not grow with them."""
+"""The REINFORCE loss of whole episodes, computed in chunks of decisions so that memory does not grow with a batch."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from dan_policy.episode import Episode
 class EpisodicReinforceLoss(LossModule):
     """-(R - b) * log-probability, summed over decisions and averaged over episodes (paper, Sec. 5.1).
 
-    The keys are those of TorchRL's ``ReinforceLoss`` (reads ``action``, ``advantage`` and what the actor reads, writes
-    ``loss_actor``); that one averages over decisions and wants a critic. Losses of parts of a batch add up to the
-    whole's.
+    The keys are those of TorchRL's ``ReinforceLoss`` (it reads ``action``, ``advantage`` and what the actor reads, and
+    writes ``loss_actor``). TorchRL's averages over decisions and needs a critic. The losses of parts of a batch add up
+    to the loss of the whole.
 
     Args:
-        actor_network: as ``make_actor`` builds it.
-        n_episodes: to average over, however many decisions are given at a time.
+        actor_network: an actor from ``make_actor``.
+        n_episodes: number of episodes to average over, however many decisions ``forward`` receives at a time.
     """
 
     @dataclass
@@ -43,7 +43,7 @@ class EpisodicReinforceLoss(LossModule):
 
     @property
     def functional(self) -> bool:
-        """The actor is used as it is."""
+        """False: the loss holds the actor itself, not a functional copy."""
         return False
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -61,20 +61,22 @@ def log_probs(
 
 
 def decisions_with_advantage(episode: Episode, advantage: Tensor) -> TensorDictBase:
-    """All real decisions of a batch of episodes in one row, in order of time, each with its episode's advantage (B,).
+    """All N decisions of a batch of episodes as a TensorDict [N], each with its episode's ``advantage`` (B,).
 
-    Padding after an episode's end is left out. Relative coordinates change at every decision, so each is a sample of
-    its own; those of one time are neighbours, which keeps ``prune_visited`` efficient.
+    Padding after an episode's end is left out. Decisions are sorted by their index in the episode: neighbours have
+    about equally many unvisited cities, which keeps ``prune_visited`` efficient.
     """
+    if episode.decisions is None:
+        raise ValueError("the episodes must keep their decisions: play(..., keep=True)")
     decisions = episode.decisions.set("advantage", advantage.expand_as(episode.valid))
     return decisions[episode.valid]
 
 
 def subsample(decisions: TensorDictBase, share: float) -> TensorDictBase:
-    """A random ``share`` of the decisions, at least one, in their order; advantages grow so that sums keep their mean.
+    """A random ``share`` of the decisions, at least one, in their order; advantages are scaled up by 1 / share.
 
-    An unbiased estimate of the whole batch's gradient for a share of the backward pass, most of a step's time: the
-    decisions of an episode have one advantage, whose noise they share.
+    It gives an unbiased estimate of the whole batch's gradient for a share of the backward pass, which takes most of a
+    step's time. Little is lost: all decisions of an episode share the noise of one advantage.
     """
     if share >= 1:
         return decisions
@@ -90,7 +92,7 @@ def chunks(decisions: TensorDictBase, size: int) -> Iterator[TensorDictBase]:
 
 
 def backward(loss: EpisodicReinforceLoss, decisions: TensorDictBase, chunk: int) -> float:
-    """Add the loss's gradient to the parameters, ``chunk`` decisions in memory at a time; return the loss."""
+    """Add the loss's gradient to the parameters, ``chunk`` decisions at a time. Returns the loss."""
     total = torch.zeros((), device=decisions.device)
     for part in chunks(decisions, chunk):
         value = loss(part)["loss_actor"]

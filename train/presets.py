@@ -1,16 +1,19 @@
-"""Configurations by name."""
+"""Configurations of REINFORCE by name."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated
 
-from dan_policy.network import DANConfig
+import tyro
+
+from dan_policy.dan import DANConfig
 from train.config import ReinforceConfig
 
 PAPER = ReinforceConfig(curriculum=((80_000, 20, 200, 5, 10),))
-"""The paper's training (Sec. 5.1), with one optimiser step per batch instead of one per agent.
+"""The paper's training (Sec. 5.1), except that the optimiser takes one step per batch instead of one per agent.
 
-The last fifth of the steps is on up to 200 nodes, as the last 24 of the paper's 120 hours were.
+The last fifth of the steps is on up to 200 nodes, like the last 24 of the paper's 120 hours.
 """
 
 QUICK = replace(
@@ -31,7 +34,7 @@ QUICK = replace(
     validate_every=50,
     checkpoint_every=50,
 )
-"""Small instances, the depot rule "final" and a larger step: learns within minutes on two CPU cores."""
+"""Small instances, the depot rule "final" and a larger learning rate: learns within minutes on two CPU cores."""
 
 REFINE = replace(
     PAPER,
@@ -53,10 +56,19 @@ REFINE = replace(
     validate_every=50,
     checkpoint_every=50,
 )
-"""From imitated weights (``init``): many samples of few instances, each other's baseline."""
+"""For weights that were trained by imitation (``init``): many samples of few instances, with the shared baseline."""
 
-PRESETS = {
-    "paper": ("the paper's: n in [20, 100], later up to 200, m in [5, 10], 8 instances a step, Adam 1e-5", PAPER),
-    "refine": ("sharpens imitated weights (--init): 8 samples of each instance, each other's baseline", REFINE),
-    "quick": ("n in [10, 30], m in [2, 5], 128 instances a step: learns within minutes on a CPU", QUICK),
+PRESETS = {"paper": PAPER, "refine": REFINE, "quick": QUICK}
+DESCRIPTIONS = {
+    "paper": "The paper's setting: n in [20, 100], later up to 200, m in [5, 10], 8 instances per step, Adam 1e-5.",
+    "refine": "Improve weights that were trained by imitation (--init): 8 samples per instance, shared baseline.",
+    "quick": "n in [10, 30], m in [2, 5], 128 instances per step: learns within minutes on a CPU.",
 }
+
+if TYPE_CHECKING:
+    Preset = ReinforceConfig
+else:  # the command line offers the presets as subcommands
+    Preset = Annotated[
+        tyro.extras.subcommand_type_from_defaults(PRESETS, DESCRIPTIONS),
+        tyro.conf.arg(name="", help="Preset, whose options may be changed."),
+    ]

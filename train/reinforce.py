@@ -9,17 +9,20 @@ import torch
 
 from dan_policy.actor import make_actor
 from dan_policy.episode import Episode
+from mtsp_env.instance import Problem
 from train.baseline import Baseline, RolloutBaseline, SharedBaseline
-from train.collect import Instances, autocast, draw, play, repeat
+from train.collect import autocast, draw, play, repeat
 from train.config import ReinforceConfig
 from train.distributed import average_gradients, processes, world_size
-from train.learner import Learner, check_folder, run
+from train.learner import Learner
+from train.loop import check_folder, run
 from train.loss import EpisodicReinforceLoss, backward, decisions_with_advantage, subsample
+from train.presets import Preset
 from train.remote import RayWorkers
 
 
-class Trainer(Learner):
-    """What changes during a run, and one step of it."""
+class ReinforceLearner(Learner):
+    """What changes during a run of REINFORCE, and one step of it."""
 
     config: ReinforceConfig
 
@@ -34,10 +37,10 @@ class Trainer(Learner):
         self.workers: RayWorkers | None = None
 
     def train_step(self) -> dict[str, float]:
-        """One batch: play it, compare it with the baseline, one optimiser step. Returns what to log."""
+        """Play a batch, compare it with the baseline, take one optimiser step. Returns the numbers to log."""
         config, start = self.config, time.perf_counter()
-        instances, episode = self.collect()
-        value = self.baseline.value(instances, episode.reward)
+        problem, episode = self.collect()
+        value = self.baseline.value(problem, episode.reward)
 
         advantage = episode.reward - value
         if config.normalise:
@@ -54,27 +57,27 @@ class Trainer(Learner):
         self.average.update_parameters(self.network)
 
         self.step += 1
-        self.instances += len(instances.nodes) // config.samples * world_size()
-        logs = {
+        self.instances += len(problem.nodes) // config.samples * world_size()
+        logs: dict[str, float] = {
             "cost": -float(episode.reward.mean()),
             "baseline": -float(value.mean()),
             "grad_norm": float(norm),
-            "learning_rate": self.schedule.get_last_lr()[0],
+            "learning_rate": float(self.schedule.get_last_lr()[0]),
             "episodes_per_second": len(advantage) * world_size() / (time.perf_counter() - start),
         }
         if self.step % config.challenge_every == 0:
-            logs["baseline_replaced"] = float(self.baseline.challenge(self.policy()))
+            logs["baseline_replaced"] = float(self.baseline.challenge(self.averaged_network))
         return logs
 
-    def collect(self) -> tuple[Instances, Episode]:
-        """Fresh instances, and the policy's episodes on them: played here, or by Ray workers."""
+    def collect(self) -> tuple[Problem, Episode]:
+        """Fresh instances and the network's episodes on them, played in this process or by Ray workers."""
         config = self.config
         if config.collector == "ray":
             self.workers = self.workers or RayWorkers(self.network, config, self.step)
             return self.workers.collect()
         drawn = draw(self.rng, config.at(self.step), config.batch_size, config.batch_tokens)
-        instances = repeat(drawn, config.samples)
-        return instances, play(self.network, instances, config, "sample", keep=True)
+        problem = repeat(drawn, config.samples)
+        return problem, play(self.network, problem, config, "sample", keep=True)
 
     def close(self) -> None:
         """End the Ray workers."""
@@ -93,19 +96,24 @@ class Trainer(Learner):
             getattr(self, part).load_state_dict(state[part])
 
 
-def reinforce(config: ReinforceConfig) -> Trainer:
-    """Train until ``config.steps`` or ``config.seconds`` are over, or Ctrl-C; saves in any case.
+def reinforce(config: Preset) -> ReinforceLearner:
+    """Train a network by REINFORCE, from a preset with any option changed.
 
-    Under ``torchrun`` every process trains on batches of its own, and all take the same steps.
+    A run ends after `steps`, after `seconds`, or on Ctrl-C, and saves in any case. Under torchrun every process trains
+    on its own batches, and all take the same steps.
+
+    Args:
+        config: the preset.
 
     Raises:
-        FileExistsError: ``config.out`` holds another run and ``resume`` was not asked for.
-        ValueError, OSError: nothing to resume, or another configuration.
+        FileExistsError: ``config.out`` holds another run and ``resume`` is not set.
+        ValueError: the run to resume had another configuration, or a value does not fit.
+        OSError: there is no run to resume, or no such weights.
     """
     with processes(config.device):
         check_folder(config)
         if config.collector == "ray" and world_size() > 1:
             raise ValueError("collector must be 'here' under torchrun, got 'ray'")
-        trainer = Trainer(config)
-        run(trainer)
-    return trainer
+        learner = ReinforceLearner(config)
+        run(learner)
+    return learner

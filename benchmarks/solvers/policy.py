@@ -6,7 +6,7 @@ They run on the CPU, as all other solvers do, so that times can be compared.
 from __future__ import annotations
 
 from benchmarks.policies import nearest as policies
-from dan_policy import make_actor
+from dan_policy import SolveOptions
 from dan_policy import solve as solve_with
 from mtsp_env.instance import Instance, Tours
 
@@ -23,9 +23,10 @@ def dan(
 
     With ``augment`` the instance is solved in the eight symmetries of the square.
     """
+    options = SolveOptions(augment=augment, seed=seed, device="cpu")
     if samples is None:
-        return solve_with(instance, policy, augment=augment, device="cpu").tours
-    return solve_with(instance, policy, "sample", samples, seed, device="cpu", augment=augment).tours
+        return solve_with(instance, policy, options).tours
+    return solve_with(instance, policy, options, decode="sample", samples=samples).tours
 
 
 def improved_dan(instance: Instance, seconds: float, seed: int, policy: str = "default") -> Tours:
@@ -35,9 +36,9 @@ def improved_dan(instance: Instance, seconds: float, seed: int, policy: str = "d
 
 def nearest(instance: Instance, seconds: float, seed: int) -> Tours:
     """Tours of agents that go to the nearest unvisited city; ``seconds`` is ignored."""
-    return solve_with(instance, make_actor(policies.nearest), device="cpu").tours
+    return solve_with(instance, policies.nearest, device="cpu").tours
 
 
 def uniformly_random(instance: Instance, seconds: float, seed: int) -> Tours:
     """Tours of one episode of uniformly random legal actions; ``seconds`` is ignored."""
-    return solve_with(instance, make_actor(policies.uniformly_random), "sample", 1, seed, device="cpu").tours
+    return solve_with(instance, policies.uniformly_random, decode="sample", samples=1, seed=seed, device="cpu").tours

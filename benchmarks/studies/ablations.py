@@ -20,13 +20,13 @@ from benchmarks.files import write_text
 from benchmarks.harness.machine import describe_machine
 from benchmarks.reports.markdown import markdown_table
 from benchmarks.suite import SEED, Cell
-from dan_policy import DANConfig, make_actor
+from dan_policy import DANConfig
 from dan_policy.episode import Decode, rollout
-from dan_policy.solution import SPEED
+from dan_policy.planning import SPEED
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.tours import makespan
 from train.config import ImitateConfig
-from train.imitate import Imitator, imitate
+from train.imitate import ImitationLearner, imitate
 from train.presets import REFINE
 from train.reinforce import reinforce
 
@@ -45,13 +45,13 @@ class Variant:
         name: its name in the table.
         imitation: share of the time for imitation; the rest is REINFORCE with a baseline shared by samples.
         network: differences from the shipped configuration of DAN.
-        policy: a network other than DAN, as ``RunConfig.policy`` takes it.
+        policy: the network, as ``RunConfig.policy`` takes it.
     """
 
     name: str
     imitation: float = 0.7
     network: dict[str, Any] = field(default_factory=dict)
-    policy: str | None = None
+    policy: str = "dan"
 
 
 VARIANTS = (
@@ -124,7 +124,7 @@ def train_and_evaluate(variant: Variant, seconds: float, seed: int, folder: Path
         config = replace(REFINE, out=folder / f"{stem}-reinforce", steps=10**9, init=init, **common)
         run = reinforce(replace(config, seconds=(1 - variant.imitation) * seconds))
         reinforce_steps, spent = run.step, spent + run.seconds
-    network = run.policy().eval()
+    network = run.averaged_network.eval()
     return {
         "imitation_steps": imitation_steps,
         "reinforce_steps": reinforce_steps,
@@ -136,7 +136,7 @@ def train_and_evaluate(variant: Variant, seconds: float, seed: int, folder: Path
 
 def seconds_per_step(config: ImitateConfig) -> float:
     """Seconds for a step of imitation, labelling included, measured on a run that is thrown away."""
-    learner = Imitator(config)
+    learner = ImitationLearner(config)
     learner.train_step()
     start, steps = time.perf_counter(), 0
     while time.perf_counter() - start < TRIAL:
@@ -150,13 +150,12 @@ def gaps(network: nn.Module, cell: Cell, decode: Decode) -> list[float]:
     """The gap of each instance to its best known tours, greedy or for the best of SAMPLES; 0.1 is 10 %."""
     instances, kept = cell.instances(SEED), best_known.read(cell, SEED)
     batch = SAMPLES if decode == "sample" else 1
-    actor = make_actor(network)
-    env = BatchedMTSP(cell.n_nodes, cell.n_agents, [batch], SPEED, depot="final", check_actions=False)
+    env = BatchedMTSP(cell.n_nodes, cell.n_agents, batch, SPEED, depot="final", check_actions=False)
     torch.manual_seed(SEED)
     values = []
     for i, instance in enumerate(instances):
         nodes = torch.as_tensor(instance.nodes.copy()).expand(batch, -1, -1)
-        cost = float(env.makespan(rollout(actor, env, decode, nodes).last).min())
+        cost = float(env.makespan(rollout(network, env, decode, nodes).last).min())
         values.append(cost / makespan(instance, kept[i]) - 1)
     return values
 

@@ -8,18 +8,19 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.studies import speed_peers, speed_solve, speed_train
 from benchmarks.studies.speed_train import Precision
 from benchmarks.studies.timing import machine_title, matmul_rate, per_second, wait_for
-from dan_policy import DAN, DANConfig, load, make_actor, rollout
+from dan_policy import DAN, DANConfig, load, rollout
 from dan_policy.episode import find_device
 from mtsp_env import mtsp_v0
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.checks import check_count, check_seconds
 from train.presets import QUICK
-from train.reinforce import Trainer
+from train.reinforce import ReinforceLearner
 
 
 def main(
@@ -112,7 +113,7 @@ def aec_decisions(n_nodes: int, n_agents: int, seconds: float) -> float:
 
 def batched_decisions(batch: int, device: str, seconds: float) -> float:
     """Decisions per second of whole episodes under random legal actions; finished games do not count."""
-    env = BatchedMTSP(50, 5, [batch], depot="final", device=device, seed=0, check_actions=False)
+    env = BatchedMTSP(50, 5, batch, depot="final", device=device, seed=0, check_actions=False)
 
     def episodes() -> int:
         td = env.reset()
@@ -123,15 +124,14 @@ def batched_decisions(batch: int, device: str, seconds: float) -> float:
     return per_second(episodes, seconds, wait_for(device))
 
 
-def greedy_instances(network: DAN, device: str, seconds: float) -> tuple[float, float]:
+def greedy_instances(network: nn.Module, device: str, seconds: float) -> tuple[float, float]:
     """Instances solved greedily per second at n = 50, m = 5, B = 64, and FLOP per instance."""
-    env = BatchedMTSP(50, 5, [64], depot="final", device=device, seed=0, check_actions=False)
-    actor = make_actor(network)
+    env = BatchedMTSP(50, 5, 64, depot="final", device=device, seed=0, check_actions=False)
     with FlopCounterMode(display=False) as counter:
-        rollout(actor, env, "greedy")
+        rollout(network, env, "greedy")
 
     def solve_batch() -> int:
-        rollout(actor, env, "greedy")
+        rollout(network, env, "greedy")
         return 64
 
     return per_second(solve_batch, seconds, wait_for(device)), counter.get_total_flops() / 64
@@ -139,7 +139,7 @@ def greedy_instances(network: DAN, device: str, seconds: float) -> tuple[float, 
 
 def trained_instances(device: str, precision: str, seconds: float) -> float:
     """Instances per second of whole training steps of the preset "quick": rollout, baseline, gradient, update."""
-    trainer = Trainer(
+    learner = ReinforceLearner(
         replace(
             QUICK,
             device=device,
@@ -153,7 +153,7 @@ def trained_instances(device: str, precision: str, seconds: float) -> float:
     )
 
     def step() -> int:
-        trainer.train_step()
-        return trainer.config.batch_size
+        learner.train_step()
+        return learner.config.batch_size
 
     return per_second(step, seconds, wait_for(device))

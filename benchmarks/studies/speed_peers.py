@@ -112,7 +112,7 @@ def speed_table(seconds: float, repeats: int, python: Path = PYTHON, compiled: b
 
 
 def _environment(batch: int) -> BatchedMTSP:
-    return BatchedMTSP(N_NODES, N_AGENTS, [batch], depot="final", seed=0, check_actions=False)
+    return BatchedMTSP(N_NODES, N_AGENTS, batch, depot="final", seed=0, check_actions=False)
 
 
 def measure(env: BatchedMTSP, seconds: float) -> Timings:

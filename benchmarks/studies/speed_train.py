@@ -17,9 +17,9 @@ from benchmarks.studies.timing import machine_title, matmul_rate, per_second, wa
 from train.collect import draw, play, repeat
 from train.config import ImitateConfig
 from train.demonstrations import demonstrate
-from train.imitate import Imitator
+from train.imitate import ImitationLearner
 from train.presets import REFINE
-from train.reinforce import Trainer
+from train.reinforce import ReinforceLearner
 
 SIZES = ((20, 3), (50, 5), (100, 10), (200, 20))
 TOKENS = 3200  # instances times nodes in a batch
@@ -51,14 +51,14 @@ def speed_table(
 def rollouts(setting: dict, batch: int, seconds: float) -> tuple[float, float, float]:
     """Sampled episodes: instances, decisions and useful FLOP per second."""
     config = replace(REFINE, **setting)
-    trainer = Trainer(config)
-    instances = draw(np.random.default_rng(0), config, batch)
+    learner = ReinforceLearner(config)
+    problem = draw(np.random.default_rng(0), config, batch)
     with FlopCounterMode(display=False) as counter:
-        episode = play(trainer.network, instances, config, "sample")
+        episode = play(learner.network, problem, config, "sample")
     decisions, flops = int(episode.valid.sum()), counter.get_total_flops()
 
     def once() -> int:
-        play(trainer.network, instances, config, "sample")
+        play(learner.network, problem, config, "sample")
         return 1
 
     times = per_second(once, seconds, wait_for(config.device))
@@ -69,7 +69,7 @@ def imitation(setting: dict, batch: int, seconds: float) -> tuple[float, float, 
     """Optimiser steps on existing demonstrations: instances, decisions and useful FLOP per second."""
     tokens = batch * setting["n_nodes"][0]
     config = replace(ImitateConfig(), **setting, workers=0, teacher_iterations=1, set_tokens=tokens, buffer=4)
-    learner = Imitator(config)
+    learner = ImitationLearner(config)
     learner.buffer.draw(1)
     sets = list(learner.buffer.sets)
 
@@ -90,18 +90,18 @@ def imitation(setting: dict, batch: int, seconds: float) -> tuple[float, float, 
 def reinforcement(setting: dict, batch: int, seconds: float) -> tuple[float, float, float]:
     """Whole training steps of the preset "refine": instances, decisions and useful FLOP per second."""
     config = replace(REFINE, **setting, batch_size=max(1, batch // REFINE.samples), batch_tokens=None)
-    trainer = Trainer(config)
-    instances = repeat(draw(np.random.default_rng(0), config, config.batch_size), config.samples)
-    decisions = int(play(trainer.network, instances, config, "sample").valid.sum())
+    learner = ReinforceLearner(config)
+    problem = repeat(draw(np.random.default_rng(0), config, config.batch_size), config.samples)
+    decisions = int(play(learner.network, problem, config, "sample").valid.sum())
 
     def step() -> int:
-        trainer.train_step()
+        learner.train_step()
         return 1
 
     with FlopCounterMode(display=False) as counter:
         step()
     times = per_second(step, seconds, wait_for(config.device))
-    return times * len(instances.nodes), times * decisions, times * counter.get_total_flops()
+    return times * len(problem.nodes), times * decisions, times * counter.get_total_flops()
 
 
 def teaching(n_nodes: int, n_agents: int, seconds: float) -> float:

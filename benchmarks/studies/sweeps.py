@@ -14,7 +14,7 @@ from benchmarks.harness.machine import describe_machine
 from benchmarks.reports.markdown import markdown_table
 from benchmarks.suite import Cell
 from dan_policy import Solution, solve
-from dan_policy.solution import sample_clip
+from dan_policy.heuristics import sampling_clip
 from mtsp_env.checks import check_count
 from mtsp_env.instance import Instance
 
@@ -47,16 +47,16 @@ def sweep_clip(
     """
 
     def solve_with(c: float, instance: Instance, seed: int) -> Solution:
-        return solve(instance, policy, "sample", samples, seed, augment=augment, clip=c)
+        return solve(instance, policy, decode="sample", samples=samples, seed=seed, augment=augment, clip=c)
 
     cells = _cells(sizes, instances)
     title = f"# Samples over C: best of {samples}{' in eight symmetries' if augment else ''}"
     note = (
-        f'C is `dan_policy.solution.sample_clip`; the first line of a size has its value. Weights "{policy}". '
+        f'C is `dan_policy.heuristics.sampling_clip`; the first line of a size has its value. Weights "{policy}". '
         f"Made by `python -m benchmarks sweep-clip --sizes {' '.join(sizes)} --instances {instances} "
         f"--samples {samples}{' --augment' if augment else ''}`."
     )
-    values = [[factor * sample_clip(10.0, cell.n_nodes, augment) for factor in C_FACTORS] for cell in cells]
+    values = [[factor * sampling_clip(10.0, cell.n_nodes, augment) for factor in C_FACTORS] for cell in cells]
     _sweep(out, title, note, "C", cells, values, solve_with)
 
 

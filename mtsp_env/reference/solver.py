@@ -3,7 +3,7 @@
 Kept because no library does as well by the makespan. On five uniform instances each of n, m = 50, 5; 100, 5; 200, 10
 and one busy core, PyVRP 0.14, whose limit on each tour a bisection brings down from the same greedy insertion, was
 2 to 12 % longer after 0.1 s, 0.05 to 1.2 % after 1 s, and almost level, 0.01 to 0.4 %, after 5 s; OR-Tools 9.15, guided
-local search with a cost on the longest tour, was 1 to 11 % longer after 5 s (``python -m benchmarks.libraries``).
+local search with a cost on the longest tour, was 1 to 11 % longer after 5 s (``python -m benchmarks libraries``).
 """
 
 from __future__ import annotations

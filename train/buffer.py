@@ -1,0 +1,119 @@
+"""Sets of demonstrations to learn from, made by worker processes while the network learns."""
+
+from __future__ import annotations
+
+import hashlib
+import multiprocessing
+import os
+from collections.abc import Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from dan_policy.actor import Key
+from dan_policy.registry import find
+from train.config import ImitateConfig
+from train.demonstrations import Demonstrations, as_decisions, demonstrate
+
+
+class Buffer:
+    """The sets at hand, and which of their decisions are still to be drawn.
+
+    Set i depends on the configuration and i alone, so that the buffer's state is a few numbers: a continuation makes
+    the same sets again.
+
+    Args:
+        keys: the parts of the observation that the network needs.
+        rng: draws sets and decision indices.
+    """
+
+    def __init__(self, config: ImitateConfig, keys: Sequence[Key], rng: np.random.Generator):
+        self.config, self.keys, self.rng = config, keys, rng
+        self.student = None if config.roll_in is None else hashlib.sha256(find(config.roll_in).read_bytes()).hexdigest()
+        self.indices: list[int] = []  # index of each set at hand
+        self.left: list[list[int]] = []  # decision indices of each that are still to be drawn
+        self.sets: list[tuple[TensorDictBase, Tensor]] = []  # decisions [T, B], valid (T, B)
+        self.next, self.instances = 0, 0
+        self._pool: ProcessPoolExecutor | None = None
+        self._pending: dict[int, Future] = {}
+
+    def draw(self, count: int) -> list[TensorDictBase]:
+        """All decisions at one index of each of ``count`` sets. Fresh sets replace those that are used up."""
+        while len(self.sets) < self.config.buffer:
+            self.add(self.next)
+        batches = []
+        for i in self.rng.choice(len(self.sets), count, replace=False).tolist():
+            (decisions, valid), step = self.sets[i], self.left[i].pop()
+            batches.append(decisions[step][valid[step]])
+        remaining = [i for i, left in enumerate(self.left) if left]
+        self.indices = [self.indices[i] for i in remaining]
+        self.left = [self.left[i] for i in remaining]
+        self.sets = [self.sets[i] for i in remaining]
+        return batches
+
+    def add(self, index: int) -> None:
+        """Make the set of that index, and choose which of its decision indices to draw, in random order."""
+        demonstrations = self._demonstrations(index)
+        decisions, valid = as_decisions(demonstrations, self.keys, self.config)
+        count = max(1, round(self.config.passes * len(valid)))
+        if self.config.roll_in is None:
+            steps = self.rng.permutation(len(valid))[:count]
+        else:  # right after the student's part, where its mistakes still show
+            steps = self.rng.permutation(np.arange(demonstrations.begin, len(valid))[:count])
+        self.indices.append(index)
+        self.left.append(steps.tolist())
+        self.sets.append((decisions, valid))
+        self.next, self.instances = index + 1, self.instances + valid.shape[1]
+
+    def _demonstrations(self, index: int) -> Demonstrations:
+        """The set of that index. Workers are kept busy with the next sets, twice as many as there are workers."""
+        if self.config.workers == 0:
+            return demonstrate(self.config, index)
+        if self._pool is None:
+            spawn = multiprocessing.get_context("spawn")  # a fork of a process with threads may hang
+            self._pool = ProcessPoolExecutor(self.config.workers, spawn, _one_thread)
+        for ahead in range(index, index + 2 * self.config.workers + 1):
+            if ahead not in self._pending:
+                self._pending[ahead] = self._pool.submit(demonstrate, self.config, ahead)
+        return self._pending.pop(index).result()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Which sets are at hand, and what is left of each."""
+        return {
+            "indices": self.indices,
+            "left": self.left,
+            "next": self.next,
+            "instances": self.instances,
+            "student": self.student,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Make the same sets again.
+
+        Raises:
+            ValueError: the student's weights have changed since the run began.
+        """
+        if state["student"] != self.student:
+            raise ValueError(f"roll_in={self.config.roll_in!r} holds other weights than when the run began")
+        self.indices, self.left = list(state["indices"]), [list(left) for left in state["left"]]
+        self.sets = [as_decisions(self._demonstrations(index), self.keys, self.config) for index in self.indices]
+        self._pending.clear()
+        self.next, self.instances = state["next"], state["instances"]
+
+    def close(self) -> None:
+        """End the worker processes."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+            self._pool = None
+            self._pending.clear()
+
+
+def _one_thread() -> None:
+    """Set up a worker: it shares the cores with the learning process and runs at a lower priority."""
+    torch.set_num_threads(1)
+    if hasattr(os, "nice"):
+        os.nice(5)

@@ -1,0 +1,68 @@
+"""The network that a run trains: a registered one by its name, or one of your own by its factory."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict, is_dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from dan_policy.actor import Key, make_actor
+from dan_policy.registry import NETWORKS, build, load, save
+from train.config import ImitateConfig, RunConfig
+
+
+def make_network(config: RunConfig) -> nn.Module:
+    """The network that ``config.policy`` names, with fresh weights or those of ``config.init``.
+
+    Raises:
+        OSError: no such weights.
+        ValueError: no such factory, or weights that do not fit.
+    """
+    if config.init is None:
+        return build(config.policy, config.network_options())
+    network = load_weights(config.init, config)
+    if config.registered and not isinstance(network, NETWORKS[config.policy].module):
+        raise ValueError(
+            f"init={config.init!r} holds a {type(network).__name__}, but policy is {config.policy!r}: "
+            f"give another policy of {sorted(NETWORKS)}"
+        )
+    return network if config.prune_visited is None else _pruned(network, config)
+
+
+def load_weights(path: str | os.PathLike, config: RunConfig) -> nn.Module:
+    """The network in a weights file: one that the file describes, or ``config.policy``'s factory with its weights."""
+    return load(path, network=None if config.registered else build(config.policy, config.network_options()))
+
+
+def load_student(config: ImitateConfig) -> nn.Module:
+    """The network of ``config.roll_in``, in evaluation mode."""
+    if config.roll_in is None:
+        raise ValueError("roll_in must name the student's weights, got None")
+    return load_weights(config.roll_in, config).eval()
+
+
+def save_weights(path: Path, network: nn.Module, config: RunConfig, extra: dict[str, Any]) -> None:
+    """Write a network that was trained with ``config``, and how to build it again; ``extra`` as for ``save``."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if config.registered:
+        save(path, network, **extra)
+    else:
+        save(path, network, config.policy, config.network_options(), **extra)
+
+
+def observation_keys(network: nn.Module) -> tuple[Key, ...]:
+    """What must be kept of an observation to evaluate the network's policy again: its inputs and ``action_mask``."""
+    return tuple(dict.fromkeys(make_actor(network).in_keys))
+
+
+def _pruned(network: nn.Module, config: RunConfig) -> nn.Module:
+    """The same weights in a network with another ``prune_visited``."""
+    options: dict[str, Any] = asdict(network.config) if is_dataclass(network.config) else {}
+    if "prune_visited" not in options:
+        raise ValueError(f"prune_visited must be None: the policy {config.policy!r} has no such option")
+    changed = build(config.policy, options | {"prune_visited": config.prune_visited})
+    changed.load_state_dict(network.state_dict())
+    return changed.eval()
