@@ -21,14 +21,18 @@ ENV_TESTS = [
 ]
 DAN_TESTS = [
     *ENV_TESTS,
+    "tests/test_actor.py",
     "tests/test_batched.py",
     "tests/test_cli.py",
     "tests/test_cli_process.py",
+    "tests/test_dan.py",
+    "tests/test_games.py",
+    "tests/test_heuristics.py",
     "tests/test_mtsp_v0.py",
-    "tests/test_policy.py",
+    "tests/test_planning.py",
+    "tests/test_registry.py",
     "tests/test_rules.py",
     "tests/test_shipped.py",
-    "tests/test_weights.py",
 ]
 
 

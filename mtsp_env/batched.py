@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -18,9 +19,10 @@ except ImportError as error:
     raise ImportError('mtsp_env.batched needs TorchRL: pip install "mtsp-env[dan]"') from error
 
 from mtsp_env import rules
+from mtsp_env.arrays import library
 from mtsp_env.checks import check_count
 from mtsp_env.distributions import Generator, check_distribution, sample
-from mtsp_env.instance import FIELDS, ArrayField, Problem, Tours, check_arrays
+from mtsp_env.instance import FIELDS, Array, ArrayField, Problem, Tours, check_arrays
 
 Arrays = dict[str, "torch.Tensor"]
 
@@ -130,7 +132,7 @@ class BatchedMTSP(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         self._rng = np.random.default_rng(seed)
 
-    def compile(self, **options: object) -> BatchedMTSP:
+    def compile(self, **options: Any) -> BatchedMTSP:
         """Run the rules through ``torch.compile`` from now on; returns this environment.
 
         The first step takes some seconds, longer still if nothing was compiled on this machine before. If compiling
@@ -180,7 +182,7 @@ class BatchedMTSP(EnvBase):
     def _given_arrays(self, tensordict: TensorDictBase | None) -> Arrays:
         game = None if tensordict is None else tensordict.get("game", None)
         nodes = None if game is None else game.get("nodes", None)
-        if nodes is None:
+        if game is None or nodes is None:
             keys = [] if tensordict is None else sorted(map(str, tensordict.keys(True, True)))
             raise ValueError(f"set_state=True needs the key ('game', 'nodes'), got {keys}")
         shape = (*self.batch_size, self.n_nodes, 2)
@@ -218,13 +220,13 @@ class BatchedMTSP(EnvBase):
         after = rules.depart(before, self.rules, arrays["action"])
         return self._outputs(after, rules.reward(before, after, self.rules))
 
-    def _outputs(self, state: rules.State, reward: rules.Array | None = None) -> tuple[dict, dict]:
+    def _outputs(self, state: rules.State, reward: Array | None = None) -> tuple[dict, dict]:
         """Arrays at the root and arrays of the game."""
         terminated, truncated = rules.all_visited(state), rules.truncated(state, self.rules)
         over = {"done": terminated | truncated, "terminated": terminated, "truncated": truncated}
         root = {**rules.observe(state, self.rules)._asdict(), **{key: flag[:, None] for key, flag in over.items()}}
         if reward is not None:
-            xp, _ = rules.library(reward)
+            xp, _ = library(reward)
             root["reward"] = xp.astype(reward, xp.float32)[:, None]
         return root, state.arrays()
 

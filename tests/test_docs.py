@@ -2,7 +2,6 @@
 
 import functools
 import io
-import itertools
 import os
 import re
 import runpy
@@ -20,7 +19,6 @@ from dan_policy.cli import main
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
 FENCE = re.compile(r"^```(\S+) ?(\S*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)  # language, note, code
-MTSP = [sys.executable, "-c", "import sys; from dan_policy.cli import main; sys.exit(main())"]
 
 
 def fences(page: Path, language: str) -> list[tuple[str, str]]:
@@ -99,24 +97,6 @@ def test_examples_run(page: Path, example: str, tmp_path: Path) -> None:
     result = run([sys.executable, "-W", "ignore", "-c", example], folder_of(page, tmp_path))
     assert result.returncode == 0, result.stderr
     assert result.stdout.strip()
-
-
-def test_the_page_about_own_networks_works_from_its_first_line_to_its_last(tmp_path: Path) -> None:
-    """The commands of the page, one after the other, with a few seconds of training instead of a minute."""
-    page = ROOT / "docs" / "own-network.md"
-    folder_of(page, tmp_path)
-    lines = [words for words in command_lines(page) if words[0] in ("python", "mtsp")]
-    assert [program_and_options(words)[0][:3] for words in lines] == [
-        ("-m", "train", "reinforce"),
-        ("-m", "train", "validate"),
-        ("mtsp", "solve"),
-    ]
-    for words in lines:
-        arguments = ["3" if before == "--seconds" else word for before, word in itertools.pairwise(["", *words])]
-        command = [*MTSP, *arguments[1:]] if words[0] == "mtsp" else [sys.executable, *arguments[1:]]
-        result = run(command, tmp_path)
-        assert result.returncode == 0, result.stderr
-    assert "makespan" in result.stdout
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -302,6 +302,27 @@ def test_the_options_of_a_network_of_ones_own_are_fields_of_its_config():
     assert own.config == OwnConfig()
 
 
+@dataclass(frozen=True)
+class ViewConfig:
+    view: int | None = None
+
+
+def test_a_network_that_always_drops_visited_cities_has_the_default_view():
+    seen = []
+
+    class Near(nn.Module):
+        config = ViewConfig()
+
+        def forward(self, cities, agents, visited):
+            seen.append(self.config.view)
+            return -cities.norm(dim=-1)
+
+    near = Near().eval()
+    for n_nodes, options in ((399, {}), (400, {}), (400, {"view": 7})):
+        solve(uniform(np.random.default_rng(0), n_nodes, 3), near, device="cpu", **options)
+    assert list(dict.fromkeys(seen)) == [None, 100, 7]
+
+
 def test_a_network_of_ones_own_plans_from_its_file(tmp_path):
     instance, own = uniform(np.random.default_rng(0), 12, 3), Own()
     save(tmp_path / "own.safetensors", own, "somewhere:Own")
