@@ -5,6 +5,8 @@ from importlib import import_module
 _HOMES = {
     "DAN": "dan",
     "DANConfig": "dan",
+    "JointDAN": "joint",
+    "JointConfig": "joint",
     "AttentionLayer": "layers",
     "make_actor": "actor",
     "Episode": "episode",

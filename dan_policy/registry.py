@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from dan_policy.actor import Network, network_keys
 from dan_policy.dan import DAN, DANConfig
+from dan_policy.joint import JointConfig, JointDAN
 
 FORMAT = "dan-policy-2"
 DAN_ONLY = "dan-policy-1"  # the first format, which knew no other network by name; its files are still read
@@ -39,6 +40,7 @@ class NetworkType:
 
 NETWORKS: dict[str, NetworkType] = {
     "dan": NetworkType(DANConfig, DAN),
+    "joint": NetworkType(JointConfig, JointDAN),
 }
 
 
