@@ -80,7 +80,9 @@ def costs(policy: nn.Module, problems: list[Problem], config: RunConfig) -> Tens
 
 def environment(problem: Problem, config: RunConfig) -> BatchedMTSP:
     """The run's environment for a batch of that size. Environments are reused: building their specs is slow."""
-    return _environment(problem.n_nodes, problem.n_agents, len(problem.nodes), config.speed, config.depot, config.device)
+    return _environment(
+        problem.n_nodes, problem.n_agents, len(problem.nodes), config.speed, config.depot, config.device
+    )
 
 
 @lru_cache(maxsize=1024)
