@@ -153,6 +153,11 @@ def load_extra(path: str | os.PathLike[str]) -> dict[str, Any]:
     return json.loads(_read(find(path), "cpu")[0]["extra"])
 
 
+def load_config(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The configuration of a file's network, or the keyword arguments of its factory. Raises as ``load``."""
+    return json.loads(_read(find(path), "cpu")[0]["config"]) or {}
+
+
 def shipped() -> list[str]:
     """Names of the models that come with the package."""
     return sorted(path.stem for path in SHIPPED.glob("*.safetensors"))

@@ -170,7 +170,9 @@ def test_the_student_plays_the_beginning_and_the_teacher_goes_on(student):
         assert not same_choice[shown.begin :].all()
         begun.add(shown.begin)
         played = -play(load(student.roll_in), as_problem(shown), student, "greedy").reward
-        assert (teacher_costs(shown, student) <= 1.01 * played).all()  # the teacher continues near-optimally; tidy tours may give away a little
+        assert (
+            teacher_costs(shown, student) <= 1.01 * played
+        ).all()  # the teacher continues near-optimally; tidy tours may give away a little
     assert len(begun) > 3
 
 

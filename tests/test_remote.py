@@ -70,7 +70,9 @@ def test_workers_play_their_parts_with_the_weights_of_the_moment(network, cluste
                 parameter.add_(torch.randn_like(parameter))
     assert all(batch == 12 for batch, *_ in sizes)  # 2 workers, 3 instances, 2 samples
     assert [10 <= n <= 12 for _, n, _ in sizes] == [False, False, True]
-    assert not torch.equal(episode.reward, play_part(network, config, 5, 0)[1].reward.repeat(2))  # the weights have changed
+    assert not torch.equal(
+        episode.reward, play_part(network, config, 5, 0)[1].reward.repeat(2)
+    )  # the weights have changed
     workers.close()
     assert ray.is_initialized()  # not started by the workers
 

@@ -237,7 +237,9 @@ def test_drawn_sizes_cover_their_ranges():
 
 
 def test_the_policy_is_the_running_average_of_the_weights(tmp_path):
-    plain, averaged = (ReinforceLearner(replace(TINY, out=tmp_path / str(decay), average=decay)) for decay in (0.0, 0.75))
+    plain, averaged = (
+        ReinforceLearner(replace(TINY, out=tmp_path / str(decay), average=decay)) for decay in (0.0, 0.75)
+    )
     expected: dict[str, torch.Tensor] = {}
     for _ in range(3):
         plain.train_step()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import tyro
 
-from dan_policy.registry import load, load_extra, save
+from dan_policy.registry import load, load_config, load_extra, save
 
 
 def average(files: tyro.conf.Positional[tuple[str, ...]], out: Path, network: str | None = None) -> None:
@@ -28,11 +28,11 @@ def average(files: tyro.conf.Positional[tuple[str, ...]], out: Path, network: st
         raise ValueError(f"name at least 2 files to average, got {len(files)}")
     networks = [load(file, network=network) for file in files]
     mean = load(files[0], network=network)
-    kinds = [(type(one), getattr(one, "config", None)) for one in networks]
-    for file, kind in zip(files, kinds, strict=True):
-        if kind != kinds[0]:
-            raise ValueError(f"{file} has another configuration than {files[0]}: {kind}, {kinds[0]}")
+    configs = [getattr(one, "config", load_config(file)) for one, file in zip(networks, files, strict=True)]
+    for file, config in zip(files, configs, strict=True):
+        if config != configs[0]:
+            raise ValueError(f"{file} has another configuration than {files[0]}: {config}, {configs[0]}")
     states = [one.state_dict() for one in networks]
     mean.load_state_dict({name: sum(state[name] for state in states) / len(states) for name in states[0]})
     out.parent.mkdir(parents=True, exist_ok=True)
-    save(out, mean, network, averaged=[load_extra(file) for file in files])
+    save(out, mean, network, load_config(files[0]), averaged=[load_extra(file) for file in files])

@@ -10,7 +10,6 @@ from scipy.stats import ttest_rel
 from torch import Tensor, nn
 
 from mtsp_env.instance import Problem
-
 from train.collect import costs, draw_set, play
 from train.config import ReinforceConfig
 from train.distributed import gather

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import multiprocessing
 import os
+from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from typing import Any
 
@@ -13,6 +14,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from dan_policy.actor import Key
 from dan_policy.registry import find
 from train.config import ImitateConfig
 from train.demonstrations import Demonstrations, as_decisions, demonstrate
@@ -31,7 +33,7 @@ class Buffer:
         plans: label each decision with the teacher's plan for all agents (``train.plans``).
     """
 
-    def __init__(self, config: ImitateConfig, keys: tuple[str, ...], rng: np.random.Generator, plans: bool = False):
+    def __init__(self, config: ImitateConfig, keys: Sequence[Key], rng: np.random.Generator, plans: bool = False):
         self.config, self.keys, self.rng, self.plans = config, keys, rng, plans
         self.student = None if config.roll_in is None else hashlib.sha256(find(config.roll_in).read_bytes()).hexdigest()
         self.indices: list[int] = []  # index of each set at hand

@@ -7,9 +7,8 @@ from functools import lru_cache
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torchrl.modules import ProbabilisticActor
 
-from dan_policy.actor import make_actor
+from dan_policy.actor import as_actor
 from dan_policy.episode import Decode, Episode, rollout
 from dan_policy.symmetry import views
 from mtsp_env.batched import BatchedMTSP
@@ -66,7 +65,7 @@ def play(policy: nn.Module, problem: Problem, config: RunConfig, decode: Decode,
         policy: a network, or its actor.
         keep: keep each decision's action and what the policy read, so that it can be evaluated again.
     """
-    actor = policy if isinstance(policy, ProbabilisticActor) else make_actor(policy)
+    actor = as_actor(policy)
     env = environment(problem, config)
     keys = tuple(dict.fromkeys(actor.in_keys)) if keep else ()
     with autocast(config):

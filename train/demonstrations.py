@@ -6,6 +6,7 @@ every game, including its mistakes, and the teacher continues from there (DAgger
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -17,7 +18,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.modules import ProbabilisticActor
 
-from dan_policy.actor import make_actor
+from dan_policy.actor import Key, make_actor
 from dan_policy.episode import rollout
 from mtsp_env import rules
 from mtsp_env.distributions import sample
@@ -134,7 +135,7 @@ def follow(demonstrations: Demonstrations, device: torch.device | str = "cpu") -
 
 
 def as_decisions(
-    demonstrations: Demonstrations, keys: tuple[str, ...], config: ImitateConfig
+    demonstrations: Demonstrations, keys: Sequence[Key], config: ImitateConfig
 ) -> tuple[TensorDictBase, Tensor]:
     """Turn the teacher's tours into decisions, in the order of the environment's clock.
 

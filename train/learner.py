@@ -80,7 +80,7 @@ class Learner(ABC):
     def save_weights(self, name: str) -> None:
         """Write the averaged network to a file in the run's folder, ready for ``dan_policy.solve``."""
         history = {"step": self.step, "instances": self.instances, "config": self.config.to_dict()}
-        save_weights(self.config.out / name, self.averaged_network, self.config, **history)
+        save_weights(self.config.out / name, self.averaged_network, self.config, history)
 
     def save(self) -> None:
         """Write a checkpoint, and the current weights to ``last.safetensors``."""

@@ -47,7 +47,7 @@ def run(learner: Learner) -> None:
                 for logger in loggers:
                     for name, number in logs.items():
                         logger.log_scalar(name, number, step=learner.step)
-                show(learner.step, logs | {"best": learner.best})
+                show(learner.step, logs | ({"best": learner.best} if learner.best < math.inf else {}))
                 if learner.step % config.checkpoint_every == 0:
                     learner.save()
             learner.save()

@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
+from typing import Any
 
 from torch import nn
 
-from dan_policy.actor import make_actor
+from dan_policy.actor import Key, make_actor
 from dan_policy.registry import NETWORKS, build, load, save
 from train.config import ImitateConfig, RunConfig
 
@@ -43,8 +44,8 @@ def load_student(config: ImitateConfig) -> nn.Module:
     return load_weights(config.roll_in, config).eval()
 
 
-def save_weights(path: Path, network: nn.Module, config: RunConfig, **extra: object) -> None:
-    """Write a network that was trained with ``config``; its file says how to build it again."""
+def save_weights(path: Path, network: nn.Module, config: RunConfig, extra: dict[str, Any]) -> None:
+    """Write a network that was trained with ``config``, and how to build it again; ``extra`` as for ``save``."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if config.registered:
         save(path, network, **extra)
@@ -52,7 +53,7 @@ def save_weights(path: Path, network: nn.Module, config: RunConfig, **extra: obj
         save(path, network, config.policy, config.network_options(), **extra)
 
 
-def observation_keys(network: nn.Module) -> tuple[str, ...]:
+def observation_keys(network: nn.Module) -> tuple[Key, ...]:
     """What must be kept of an observation to evaluate the network's policy again: its inputs and ``action_mask``."""
     return tuple(dict.fromkeys(make_actor(network).in_keys))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.collectors import Collector
 
-from dan_policy.actor import make_actor
+from dan_policy.actor import Key, make_actor
 from dan_policy.episode import Episode, rollout
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.instance import Problem
@@ -102,7 +103,7 @@ def play_part(policy: nn.Module, config: ReinforceConfig, step: int, worker: int
         return problem, play(policy, problem, now, "sample", keep=True)
 
 
-def replay(problem: Problem, action: Tensor, keys: tuple[str, ...], config: ReinforceConfig) -> Episode:
+def replay(problem: Problem, action: Tensor, keys: Sequence[Key], config: ReinforceConfig) -> Episode:
     """The episodes in which the actions (B, T) were taken, with the observation's ``keys`` in their decisions.
 
     Actions after an episode's end are ignored.
