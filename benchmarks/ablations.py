@@ -156,7 +156,7 @@ def gaps(network: nn.Module, cell: Cell, decode: Decode) -> list[float]:
     for i, instance in enumerate(instances):
         nodes = torch.as_tensor(instance.nodes.copy()).expand(rows, -1, -1)
         cost = float(env.makespan(rollout(actor, env, decode, nodes).last).min())
-        found.append(cost / makespan(instance.nodes, known[i]) - 1)
+        found.append(cost / makespan(instance, known[i]) - 1)
     return found
 
 

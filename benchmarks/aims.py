@@ -18,8 +18,9 @@ from benchmarks import best
 from benchmarks.files import replace_text
 from benchmarks.run import describe_machine
 from benchmarks.suite import SEED, Cell
-from mtsp_env.instance import Instance, Tours, check_count
-from mtsp_env.reference import check_seconds, compile_kernels, improve
+from mtsp_env.checks import check_count, check_seconds
+from mtsp_env.instance import Instance, Tours
+from mtsp_env.reference import compile_kernels, improve
 from mtsp_env.tours import lower_bound, makespan
 
 REPORT = Path(__file__).parent / "results" / "aims.md"
@@ -163,7 +164,7 @@ def search_sample(cell: Cell, seed: int, seconds: float, count: int, workers: in
     became shorter, and the runs that it has are not run again."""
     instances, kept = cell.instances(seed), best.read(cell, seed, folder)
     key, done = _sample_key(cell, seed, seconds), _read(sampled).get(_sample_key(cell, seed, seconds), {})
-    cost = {i: makespan(instances[i].nodes, tours) for i, tours in kept.items()}
+    cost = {i: makespan(instances[i], tours) for i, tours in kept.items()}
     order = [int(i) for i in np.random.default_rng(seed).permutation(cell.count)]
     unproved = [i for i in order if i in cost and cost[i] > lower_bound(instances[i]) + best.CLOSED]
     jobs = [i for i in unproved if str(i) not in done][: max(count - len(done), 0)]
@@ -174,7 +175,7 @@ def search_sample(cell: Cell, seed: int, seconds: float, count: int, workers: in
     with ThreadPoolExecutor(workers) as pool:
         for i, tours in track(pool.map(run, jobs), total=len(jobs), description=f"{cell.label}: {seconds:g} s"):
             best.merge(cell, seed, {i: tours}, folder)
-            done[str(i)] = max(0.0, 1.0 - makespan(instances[i].nodes, tours) / cost[i])
+            done[str(i)] = max(0.0, 1.0 - makespan(instances[i], tours) / cost[i])
             replace_text(sampled, json.dumps({**_read(sampled), key: done}))
 
 
@@ -188,7 +189,7 @@ def measure(aim: Aim, cell: Cell, seed: int, out: Path, folder: Path, sample_sec
         cpu.append(time.process_time() - started_cpu)
     best.merge(cell, seed, found, folder)
     kept = best.read(cell, seed, folder)
-    cost, least = (np.array([makespan(x.nodes, tours[i]) for i, x in enumerate(instances)]) for tours in (found, kept))
+    cost, least = (np.array([makespan(x, tours[i]) for i, x in enumerate(instances)]) for tours in (found, kept))
     bound = np.array([lower_bound(instance) for instance in instances])
     searched = np.array(_spent(out.with_suffix(".json"), cell, seed)[: cell.count])
     sampled = _read(out.with_name(f"{out.stem}-sample.json")).get(_sample_key(cell, seed, sample_seconds), {})

@@ -67,8 +67,8 @@ def merge(cell: AnyCell, seed: int, found: Mapping[int, Tours], folder: Path = F
     kept, instances, better = read(cell, seed, folder), cell.instances(seed), 0
     for i, tours in found.items():
         check_tours(instances[i], tours)
-        nodes = instances[i].nodes
-        if i not in kept or makespan(nodes, tours) < makespan(nodes, kept[i]) - 1e-12:
+        instance = instances[i]
+        if i not in kept or makespan(instance, tours) < makespan(instance, kept[i]) - 1e-12:
             kept[i] = tours
             better += 1
     if better:
@@ -107,13 +107,13 @@ def search(cell: AnyCell, seed: int, seconds: float, workers: int = 1, folder: P
 def _improved(instance: Instance, tours: Tours | None, seconds: float, seed: int) -> Tours:
     from mtsp_env.reference import improve  # Numba: only where it is needed
 
-    if tours is not None and makespan(instance.nodes, tours) <= lower_bound(instance) + CLOSED:
+    if tours is not None and makespan(instance, tours) <= lower_bound(instance) + CLOSED:
         return tours
     found = improve(instance, seconds=seconds, seed=seed)
     if tours is None:
         return found
     polished = improve(instance, tours, seconds=seconds, seed=seed)
-    return min(found, polished, key=lambda one: makespan(instance.nodes, one))
+    return min(found, polished, key=lambda one: makespan(instance, one))
 
 
 def kept_cells(tsplib: Path | None = None, folder: Path = FOLDER) -> list[tuple[AnyCell, int]]:
@@ -131,7 +131,7 @@ def kept_cells(tsplib: Path | None = None, folder: Path = FOLDER) -> list[tuple[
 def check(cell: AnyCell, seed: int, folder: Path = FOLDER) -> str:
     """Verify the kept tours of a cell, in one line. Raises as ``read``."""
     kept, instances = read(cell, seed, folder), cell.instances(seed)
-    costs = {i: makespan(instances[i].nodes, tours) for i, tours in kept.items()}
+    costs = {i: makespan(instances[i], tours) for i, tours in kept.items()}
     proved = sum(cost <= lower_bound(instances[i]) + CLOSED for i, cost in costs.items())
     mean = f", mean {sum(costs.values()) / len(costs):.4f}" if costs else ""
     return f"{cell.label}: {len(kept)} of {cell.count} instances{mean}, {proved} at the lower bound"

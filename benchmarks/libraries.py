@@ -37,7 +37,7 @@ def pyvrp(instance: Instance, seconds: float, seed: int) -> Tours:
     clients = [lib.Client(i) for i in range(1, len(nodes))]
 
     best = improve(instance, iterations=0)
-    low, high = (bound := lower_bound(instance)), makespan(nodes, best)
+    low, high = (bound := lower_bound(instance)), makespan(instance, best)
     while (left := end - time.perf_counter()) > 0 and high > bound + 1e-6:
         if high - low < FINE * high:
             low = bound
@@ -49,7 +49,7 @@ def pyvrp(instance: Instance, seconds: float, seed: int) -> Tours:
         found = lib.solve(data, stop, seed, collect_stats=False, initial_solution=start).best
         if found.is_feasible():
             best = [[0, *(visit.idx + 1 for visit in tour if visit.is_client()), 0] for tour in found.routes()]
-            high = makespan(nodes, best)
+            high = makespan(instance, best)
         else:
             low = limit
     return best + [[0, 0]] * (m - len(best))
@@ -73,7 +73,7 @@ def _cost(solve: solvers.Solve, instance: Instance, seconds: float, seed: int) -
     except solvers.NoTours:
         return np.nan
     check_tours(instance, tours)
-    return makespan(instance.nodes, tours)
+    return makespan(instance, tours)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,8 @@ from benchmarks import solvers
 from benchmarks.crew import Limits, check_seconds, outcomes, usable_cores
 from benchmarks.rows import Journal, Row
 from benchmarks.suite import AnyCell, TsplibCell, cells, rounded_length
-from mtsp_env.instance import Instance, check_count
+from mtsp_env.checks import check_count
+from mtsp_env.instance import Instance
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ from benchmarks.run import describe_machine
 from benchmarks.suite import Cell
 from dan_policy import Solution, solve
 from dan_policy.solution import sample_clip
-from mtsp_env.instance import Instance, check_count
+from mtsp_env.checks import check_count
+from mtsp_env.instance import Instance
 
 RESULTS = Path(__file__).parent / "results"
 SEED = 123  # of no test set and of no training

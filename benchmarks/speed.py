@@ -109,7 +109,7 @@ def batched_decisions(batch: int, device: str, seconds: float) -> float:
         td = env.reset()
         while not td["done"].all():
             td = step_mdp(env.step(env.rand_action(td)))
-        return int(td["decisions"].sum())
+        return int(td["game", "decisions"].sum())
 
     return per_second(episodes, seconds, wait_for(device))
 

@@ -157,7 +157,7 @@ class _Judge:
             return
         instance = self._instance(cell, row.seed, row.instance)
         check_tours(instance, row.tours)
-        judged = makespan(instance.nodes, row.tours)
+        judged = makespan(instance, row.tours)
         if not math.isclose(judged, row.makespan, rel_tol=TIE):
             raise ValueError(f"its makespan is {row.makespan!r}, that of its tours {judged!r}")
 

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mtsp_env.instance import Instance, Tours, check_count, sample_nodes
+from mtsp_env.checks import check_count
+from mtsp_env.distributions import sample
+from mtsp_env.instance import Instance, Tours
 from mtsp_env.tsplib import read_tsplib
 
 SEED = 7  # of the published results
@@ -25,7 +27,7 @@ class Cell:
         """The cell's instances; the first k are the same whatever ``count`` is."""
         rng = np.random.default_rng([seed, self.n_nodes, self.n_agents])
         return [
-            Instance(sample_nodes(distribution, rng, 1, self.n_nodes)[0], self.n_agents, f"{self.label}-{i}")
+            sample(distribution, rng, 1, self.n_nodes, self.n_agents).instance(0, f"{self.label}-{i}")
             for i in range(self.count)
         ]
 

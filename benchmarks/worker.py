@@ -63,7 +63,7 @@ def judge(instance: Instance, answer: Tours | solvers.Answer) -> dict[str, Any]:
         bound = None if bound is None else float(bound)
     except Exception as error:  # an answer may be anything
         return {"status": "wrong tours", "error": f"{type(error).__name__}: {error}"[:1000]}
-    return {"status": "ok", "tours": tours, "makespan": makespan(instance.nodes, tours), "bound": bound}
+    return {"status": "ok", "tours": tours, "makespan": makespan(instance, tours), "bound": bound}
 
 
 def _failed(error: BaseException) -> dict[str, Any]:

@@ -4,8 +4,8 @@ A *network* is a module or a plain function that takes the tensors of its ``in_k
 (..., n). Attributes that it may have:
 
 - ``in_keys``: the keys of the observation that it reads, by default ``OBSERVATION``; a nested key is a tuple;
-- ``config``: a dataclass. ``dan_policy.solve`` can change its fields ``tanh_clip``, ``view`` and ``prune_visited``
-  for one call, so the network should read them in each forward pass;
+- ``config``: a dataclass. ``dan_policy.solve`` can change its fields ``tanh_clip``, ``view`` and ``prune_visited``, if
+  it has them, for one call, so the network should read them in each forward pass;
 - ``supports_bfloat16``: True if its matrix products may run in bfloat16 under ``torch.autocast``.
 """
 
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import MaskedCategorical, ProbabilisticActor
@@ -50,6 +50,11 @@ def make_actor(network: Network, in_keys: Sequence[Key] | None = None) -> Probab
         distribution_class=MaskedCategorical,
         default_interaction_type=ExplorationType.RANDOM,
     )
+
+
+def as_actor(policy: Network | TensorDictModuleBase) -> TensorDictModuleBase:
+    """``policy`` itself if it is an actor, that is, reads and writes TensorDicts; else the actor of this network."""
+    return policy if isinstance(policy, TensorDictModuleBase) else make_actor(policy)
 
 
 def network_keys(network: Network) -> tuple[Key, ...]:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from mtsp_env.instance import check_count
+from dan_policy.actor import Key, Network, as_actor
+from mtsp_env.checks import check_count
+from mtsp_env.instance import Problem
 
 Decode = Literal["greedy", "sample"]
 EXPLORATION = {"greedy": ExplorationType.DETERMINISTIC, "sample": ExplorationType.RANDOM}
@@ -22,8 +26,8 @@ class Episode:
     """One whole episode per row of a batch, and nothing after its end.
 
     Attributes:
-        decisions: TensorDict of shape [T, B]: the observation that each decision was made on, and ``action``; None
-            where they were not asked for. T is the longest episode's length.
+        decisions: TensorDict of shape [T, B]: the kept keys of the observation that each decision was based on, and
+            ``action``; None if no keys were to be kept. T is the length of the longest episode.
         valid: (T, B) bool, False once a row's episode is over.
         reward: (B,) float32, each episode's undiscounted sum of rewards.
         last: TensorDict of shape [B], the last state of every row.
@@ -37,61 +41,70 @@ class Episode:
 
 @torch.no_grad()
 def rollout(
-    actor: nn.Module,
+    policy: Network | TensorDictModuleBase,
     env: EnvBase,
     decode: Decode = "sample",
-    nodes: Tensor | TensorDictBase | None = None,
-    keep: tuple[str, ...] = (),
-    most: int | None = None,
+    instances: Tensor | Problem | TensorDictBase | None = None,
+    keep: Sequence[Key] = (),
+    max_decisions: int | None = None,
 ) -> Episode:
-    """Play every row of ``env`` from a reset to its end, or for ``most`` decisions.
+    """Play every row of ``env`` from a reset to its end, or for ``max_decisions`` decisions.
 
-    ``env.rollout(break_when_all_done=True)`` would do the same with more overhead a step and rows that repeat
-    themselves after their end.
+    ``env.rollout(break_when_all_done=True)`` would do the same with more overhead per step, and its rows would go on
+    after their end. TorchRL's exploration type, which is shared by all threads of a process, is set during the call.
 
     Args:
-        actor: reads the observation and writes ``action``, as ``make_actor`` builds it.
-        env: a TorchRL environment of batch size [B] whose episodes end by themselves.
-        decode: "greedy" takes the likeliest action, "sample" draws one (from torch's global generator).
-        nodes: (B, n, 2), instances to replay, or a TensorDict of whole states to go on from; None draws fresh ones.
-        keep: keys of the observation to keep in ``decisions`` beside ``action``; none: ``decisions`` is None.
-        most: decisions of each row, at least 1; None: until its end.
+        policy: a network as ``make_actor`` takes it, or an actor that reads the observation and writes ``action``.
+        env: a TorchRL environment of batch size [B] whose episodes end by themselves, such as ``BatchedMTSP``.
+        decode: "greedy" takes the likeliest action, "sample" draws one from torch's global generator.
+        instances: the instances to play: nodes (B, n, 2), a ``Problem`` of B instances, or a TensorDict of batch size
+            [B] with the key "game", which may hold a whole state to go on from. None draws fresh ones.
+        keep: keys of the observation to keep in ``decisions`` beside ``action``; nested keys are tuples.
+        max_decisions: decisions of each row, at least 1; None plays to the end.
 
     Raises:
-        ValueError: an unknown ``decode``, or ``most`` below 1.
+        ValueError: an unknown ``decode``, ``max_decisions`` below 1, or instances that do not fit ``env``.
     """
-    if most is not None:
-        check_count("most", most, minimum=1)
+    if max_decisions is not None:
+        check_count("max_decisions", max_decisions, minimum=1)
     if decode not in EXPLORATION:
         raise ValueError(f"unknown decode {decode!r}; choose from {sorted(EXPLORATION)}")
-    if isinstance(nodes, Tensor):
-        nodes = TensorDict({"nodes": nodes}, batch_size=env.batch_size, device=env.device)
-    td = env.reset() if nodes is None else env.reset(nodes, set_state=True)
-    kept, valid = [], []
+    actor = as_actor(policy)
+    td = env.reset() if instances is None else env.reset(_as_tensordict(instances, env), set_state=True)
+    kept: list[TensorDictBase] = []
+    valid: list[Tensor] = []
     reward = torch.zeros(env.batch_size, device=env.device)
     over = td["done"][..., 0].clone()
     with set_exploration_type(EXPLORATION[decode]):
-        while len(valid) != most and not over.all():  # the one wait for the device per decision
+        while len(valid) != max_decisions and not over.all():  # the one wait for the device per decision
             td = actor(td)
             if keep:
                 kept.append(td.select(*keep, "action"))
             valid.append(~over)
-            td = step_mdp(env.step(td), exclude_reward=False)
+            td = env.step(td)["next"]
             reward += torch.where(over, 0.0, td["reward"][..., 0])
             over = over | td["done"][..., 0]
     return Episode(torch.stack(kept) if kept else None, torch.stack(valid), reward, td)
 
 
+def _as_tensordict(instances: Tensor | Problem | TensorDictBase, env: EnvBase) -> TensorDictBase:
+    if isinstance(instances, TensorDictBase):
+        return instances
+    arrays = instances.arrays if isinstance(instances, Problem) else {"nodes": instances}
+    tensors = {name: torch.as_tensor(array, device=env.device) for name, array in arrays.items()}
+    size = {"batch_size": tensors["nodes"].shape[:1], "device": env.device}
+    return TensorDict({"game": TensorDict(tensors, **size)}, **size)
+
+
 def find_device(device: torch.device | str | None = None) -> torch.device:
-    """The device of that name; None takes a GPU where there is one.
+    """The device with this name; None takes a GPU if there is one.
 
     Raises:
-        ValueError: no such device, or none here.
+        ValueError: an unknown name, or a device that this machine does not have.
     """
     try:
-        found = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-        torch.empty(0, device=found)
+        chosen = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        return torch.empty(0, device=chosen).device  # with its index: "cuda" is "cuda:0" by default
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         reason = str(error).splitlines()[0]
         raise ValueError(f"no device {str(device)!r} here; choose for example 'cpu' or 'cuda' ({reason})") from error
-    return found

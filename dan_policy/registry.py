@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -24,6 +24,7 @@ from torch import Tensor, nn
 from dan_policy.actor import Network, network_keys
 from dan_policy.dan import DAN, DANConfig
 from dan_policy.joint import JointConfig, JointDAN
+from mtsp_env.files import atomic_write
 
 FORMAT = "dan-policy-2"
 DAN_ONLY = "dan-policy-1"  # the first format, which knew no other network by name; its files are still read
@@ -32,7 +33,10 @@ SHIPPED = Path(__file__).parent / "weights"
 
 @dataclass(frozen=True)
 class NetworkType:
-    """A network of the registry: ``module(config(**fields))`` builds it, and it keeps its ``config``."""
+    """A network of the registry: ``module(config(**fields))`` builds it, and it keeps its ``config``.
+
+    All its tensors are in its ``state_dict()``: no buffer is registered with ``persistent=False``.
+    """
 
     config: type
     module: type[nn.Module]
@@ -105,20 +109,16 @@ def save(
     if not isinstance(network, nn.Module):
         raise TypeError(f"network must be a torch.nn.Module, got {type(network).__name__}")
     name = _registered_name(network)
+    config = asdict(cast(Any, network.config)) if name else dict(factory_config or {})
     metadata = {
         "format": FORMAT,
         "network": json.dumps({"name": name} if name else {"factory": factory}),
-        "config": json.dumps(asdict(network.config) if name else dict(factory_config or {})),
+        "config": json.dumps(config),
         "extra": json.dumps(extra),
     }
     tensors = {key: value.detach().cpu().contiguous() for key, value in network.state_dict().items()}
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(serialise(tensors, metadata))  # save_file's files can be read by their owner alone
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def load(
@@ -141,7 +141,7 @@ def load(
     path = find(path)
     metadata, tensors = _read(path, device)
     try:
-        module = network if isinstance(network, nn.Module) else _described_network(metadata, network)
+        module = network if isinstance(network, nn.Module) else _described_network(metadata, network, device)
         module.load_state_dict(tensors)
     except (KeyError, TypeError, RuntimeError, ValueError) as error:
         raise ValueError(f"{path}: weights and network do not fit ({error})") from error
@@ -173,11 +173,19 @@ def find(path: str | os.PathLike[str]) -> Path:
     return path
 
 
+def network_name(network: object) -> str:
+    """For tables: its name in ``NETWORKS``, or else that of its function or class."""
+    if isinstance(network, FunctionNetwork):
+        network = network.function
+    name = _registered_name(network) if isinstance(network, nn.Module) else None
+    return name or str(getattr(network, "__name__", type(network).__name__))
+
+
 def _registered_name(network: nn.Module) -> str | None:
     return next((name for name, kind in NETWORKS.items() if isinstance(network, kind.module)), None)
 
 
-def _described_network(metadata: Mapping[str, str], network: str | None) -> nn.Module:
+def _described_network(metadata: Mapping[str, str], network: str | None, device: torch.device | str) -> nn.Module:
     """The network that a file describes, built by ``network`` if the file names none of ``NETWORKS``."""
     config = json.loads(metadata["config"])
     if metadata["format"] == DAN_ONLY:
@@ -190,7 +198,9 @@ def _described_network(metadata: Mapping[str, str], network: str | None) -> nn.M
             raise ValueError(f"it holds the network {name!r}, which is none of {sorted(NETWORKS)}")
         if network not in (None, name):
             raise ValueError(f"it holds the network {name!r}, not {network!r}")
-        return build(name, config)
+        with torch.device("meta"):  # no random weights, which would be overwritten, and no use of the global generator
+            empty = build(name, config)
+        return empty.to_empty(device=device)
     if network is None or network in NETWORKS:
         named = f"names the factory {factory!r}" if factory else "holds weights alone"
         raise ValueError(f"it {named}: give the network, network={factory or 'package.module:factory'!r} for example")

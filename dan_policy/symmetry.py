@@ -1,4 +1,4 @@
-"""The unit square's symmetries: tours of a turned or mirrored instance are as good for the instance itself."""
+"""The symmetries of the unit square: tours of a rotated or reflected instance are as good for the instance itself."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ SYMMETRIES = 8
 
 
 def symmetry(nodes: Tensor, k: int) -> Tensor:
-    """The ``k``-th of the eight rotations and reflections of the unit square, of nodes (..., 2); 0 changes nothing."""
+    """The image of ``nodes`` (..., 2) under the ``k``-th of the eight rotations and reflections; 0 is the identity."""
     x, y = nodes.unbind(-1)
     x, y = (1 - x if k & 1 else x), (1 - y if k & 2 else y)
     return torch.stack([y, x] if k & 4 else [x, y], dim=-1)

@@ -1,8 +1,9 @@
-"""A plan on the terminal, for ``mtsp solve``."""
+"""A table of tours on the terminal, for ``mtsp solve``."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from rich import box
@@ -13,11 +14,11 @@ from rich.text import Text
 from mtsp_env.render import format_lengths
 
 
-def print_table(record: dict) -> None:
-    """Agents and their tours, the longest in bold, as wide as the terminal; then the makespan beside its lower bound.
+def print_table(record: dict[str, Any]) -> None:
+    """Print the agents and their tours, the longest in bold, then the makespan beside its lower bound.
 
     Args:
-        record: what ``mtsp solve --json`` prints.
+        record: the object that ``mtsp solve --json`` prints.
     """
     console = Console(highlight=False)
     *lengths, bound = format_lengths([*record["lengths"], record["lower_bound"]])
@@ -40,13 +41,15 @@ def print_table(record: dict) -> None:
     console.print(Text(f"{record['method']} in {record['seconds']:.3g} s"))
 
 
-def _compare(makespan: float, lower_bound: float, written: str) -> str:
+def _compare(makespan: float, lower_bound: float, formatted_bound: str) -> str:
     gap = makespan / lower_bound - 1 if lower_bound else 0.0
-    return f"at most {gap:.1%} above the best possible (lower bound {written})" if gap > 1e-9 else "the best possible"
+    if gap <= 1e-9:
+        return "the best possible"
+    return f"at most {gap:.1%} above the best possible (lower bound {formatted_bound})"
 
 
 def _elide(tour: Sequence[int], width: int) -> str:
-    """A tour in at most ``width`` characters where that is possible: its beginning, its end, dots between."""
+    """A tour in at most ``width`` characters if possible: its beginning, dots, its end."""
     whole = " ".join(map(str, tour))
     if len(whole) <= width:
         return whole

@@ -7,17 +7,9 @@ Importing this package needs only NumPy, Gymnasium and PettingZoo; the batched T
 ``mtsp_env.batched``.
 """
 
-from mtsp_env.instance import (
-    DISTRIBUTIONS,
-    Instance,
-    clustered,
-    from_coordinates,
-    read_instance,
-    read_tours,
-    uniform,
-    write_instance,
-    write_tours,
-)
+from mtsp_env.distributions import DISTRIBUTIONS, clustered, uniform
+from mtsp_env.files import read_instance, read_tours, write_instance, write_tours
+from mtsp_env.instance import Instance, from_coordinates
 from mtsp_env.tours import check_tours, lower_bound, makespan, tour_lengths
 from mtsp_env.tsplib import read_tsplib
 from mtsp_env.version import __version__

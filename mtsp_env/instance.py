@@ -1,122 +1,268 @@
-"""Instances of the MinMax mTSP: what they hold, where they come from, how they are stored.
+"""The problem, described once: the fields of an instance, and batches of instances of one size.
+
+``FIELDS`` describes every array of a problem: dtype, shape, unit, range. Validation, equality, hashing, pickling, JSON,
+batches and the TorchRL specs are derived from it, so that a new field is one entry here, its lines in ``rules.py`` and
+its check in ``tours.py``.
 
 Coordinates lie in the unit square, as in the paper (Sec. 6: "uniformly at random in the unit square"); ``scale`` turns
-a length there into the units of the file that the instance was read from.
+a length there into the units of the file that the instance was read from. Time is measured in units of distance at
+speed 1.
 """
+
+# ruff: noqa: RUF009 (fields of the dataclass are described by calls)
 
 from __future__ import annotations
 
-import json
 import math
-import os
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 
+from mtsp_env.checks import check_count
+
+Array = Any  # a NumPy array or a torch tensor
 Tours = list[list[int]]
 """One tour per agent: depot (0), cities, depot (0)."""
 
 
-@dataclass(frozen=True, eq=False)
-class Instance:
-    """One problem: where the nodes are and how many agents share them.
+@dataclass(frozen=True)
+class ArrayField:
+    """What one array of a problem or of a game holds.
 
     Attributes:
-        nodes: float64 (n, 2), coordinates in [0, 1]; row 0 is the depot, the others are the cities. Read-only.
+        dtype: its name, the same in NumPy and torch.
+        shape: of one instance: "n" (nodes), "m" (agents), "K" (any length of at least 1), or a number.
+        meaning: one line for the documentation, with the unit.
+        low: least value, if there is one.
+        low_allowed: whether ``low`` itself is allowed.
+        high: greatest value; infinity is allowed only if this is ``math.inf``.
+        zero_at_depot: whether entry 0 must be 0.
+        check: a further check of the array (..., *shape); returns what is wrong, or None.
+    """
+
+    dtype: str
+    shape: tuple[str | int, ...]
+    meaning: str
+    low: float | None = None
+    low_allowed: bool = True
+    high: float | None = None
+    zero_at_depot: bool = False
+    check: Callable[[np.ndarray], str | None] | None = None
+
+    def sizes(self, n_nodes: int, n_agents: int) -> tuple[int | None, ...]:
+        """The shape in numbers; None stands for any length of at least 1."""
+        numbers = {"n": n_nodes, "m": n_agents, "K": None}
+        return tuple(numbers[size] if isinstance(size, str) else size for size in self.shape)
+
+
+def _array_field(default: object, *description: Any, **limits: Any) -> Any:
+    array = ArrayField("float64", *description, **limits)
+    options = {} if default is ... else {"default": default}
+    return field(**options, metadata={"array": array})
+
+
+def _someone_keeps_going(breaks: np.ndarray) -> str | None:
+    return None if np.isinf(breaks).any(-1).all() else "at least one agent must never break down (inf)"
+
+
+@dataclass(frozen=True, eq=False)
+class Instance:
+    """One problem: where the nodes are, how many agents share them, and optionally the world that they move in.
+
+    An instance without world fields is *plain*: the paper's problem.
+
+    Attributes:
+        nodes: float64 (n, 2), coordinates in [0, 1]; row 0 is the depot, the others are the cities.
         n_agents: m, at least 1; more agents than cities is fine.
         name: for tables and pictures.
         scale: length in the source's units of a length 1 in the unit square, above 0.
+        speeds: float64 (m,) above 0: each agent's speed relative to 1; a leg of length d takes d / speed.
+        service: float64 (n,) at least 0: how long an agent stays at a node before it decides again; 0 at the depot.
+        appears: float64 (n,) at least 0: when a node becomes known to everybody; 0 at the depot.
+        breaks: float64 (m,) above 0: when each agent stops for good; inf for at least one agent.
+        traffic: float64 (m, K) above 0: factor by which an agent's k-th leg takes longer than announced (k modulo K).
+
+    All arrays are read-only copies.
 
     Raises:
-        ValueError: where one of these does not hold; the message names the value and the range.
+        ValueError: a value outside its range; the message names the value and the range.
     """
 
-    nodes: np.ndarray  # (n, 2)
+    nodes: np.ndarray = _array_field(..., ("n", 2), "coordinates in the unit square; row 0 is the depot", 0.0, high=1.0)
     n_agents: int
     name: str = ""
     scale: float = 1.0
+    speeds: np.ndarray | None = _array_field(None, ("m",), "speed relative to 1", 0.0, False)
+    service: np.ndarray | None = _array_field(None, ("n",), "time that a visit takes", 0.0, zero_at_depot=True)
+    appears: np.ndarray | None = _array_field(
+        None, ("n",), "time at which a node becomes known to everybody", 0.0, zero_at_depot=True
+    )
+    breaks: np.ndarray | None = _array_field(
+        None, ("m",), "time at which an agent stops for good", 0.0, False, math.inf, check=_someone_keeps_going
+    )
+    traffic: np.ndarray | None = _array_field(
+        None, ("m", "K"), "factor on the travel time of an agent's k-th leg, k modulo K", 0.0, False
+    )
 
     def __post_init__(self) -> None:
-        nodes = _numbers("nodes", self.nodes) + 0.0  # a copy nobody changes from outside; -0.0 becomes 0.0
-        if nodes.ndim != 2:
-            raise ValueError(f"nodes must have shape (n, 2), got {nodes.shape}")
-        check_nodes(nodes)
         check_count("n_agents", self.n_agents, minimum=1)
         if not isinstance(self.name, str):
             raise ValueError(f"name must be a string, got {self.name!r}")
-        nodes.flags.writeable = False
-        object.__setattr__(self, "nodes", nodes)
-        object.__setattr__(self, "n_agents", int(self.n_agents))
-        object.__setattr__(self, "scale", _check_scale(self.scale))
+        scale = _check_scale(self.scale)
+        arrays = {name: _read_only_copy(name, value) for name, value in self.arrays().items()}
+        if arrays["nodes"].ndim != 2:
+            raise ValueError(f"nodes must have shape (n, 2), got {arrays['nodes'].shape}")
+        check_arrays(arrays, self.n_agents)
+        for name, value in {"n_agents": int(self.n_agents), "scale": scale, **arrays}.items():
+            object.__setattr__(self, name, value)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The array fields that this instance has, by name: ``nodes`` and the fields of its world."""
+        arrays = {name: getattr(self, name) for name in FIELDS}
+        return {name: value for name, value in arrays.items() if value is not None or name == "nodes"}
 
     @property
     def n_nodes(self) -> int:
         """n, the depot included."""
         return len(self.nodes)
 
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Instance):
-            return NotImplemented
-        return np.array_equal(self.nodes, other.nodes) and (self.n_agents, self.name, self.scale) == (
-            other.n_agents,
-            other.name,
-            other.scale,
-        )
+    def _values(self) -> tuple:
+        return tuple(getattr(self, each.name) for each in fields(self))
 
-    def __reduce__(self) -> tuple:
-        return Instance, (self.nodes, self.n_agents, self.name, self.scale)  # NumPy unpickles arrays as writable
+    def _key(self) -> tuple:
+        return tuple(value.tobytes() if isinstance(value, np.ndarray) else value for value in self._values())
+
+    def __eq__(self, other: object) -> bool:
+        return self._key() == other._key() if isinstance(other, Instance) else NotImplemented
 
     def __hash__(self) -> int:
-        return hash((self.nodes.tobytes(), self.n_agents, self.name, self.scale))
+        return hash(self._key())
+
+    def __reduce__(self) -> tuple:
+        return Instance, self._values()  # NumPy unpickles arrays as writable
 
 
-def _numbers(name: str, values: object) -> np.ndarray:
-    try:
-        return np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{name} must be numbers of shape (n, 2), got {type(values).__name__}: {error}") from error
+FIELDS: dict[str, ArrayField] = {each.name: each.metadata["array"] for each in fields(Instance) if each.metadata}
+WORLD_FIELDS: tuple[str, ...] = tuple(name for name in FIELDS if name != "nodes")
 
 
-def _check_scale(scale: float) -> float:
-    try:
-        value = float(scale)
-    except (TypeError, ValueError, OverflowError):
-        value = math.nan
-    if isinstance(scale, str) or not (math.isfinite(value) and value > 0):
-        raise ValueError(f"scale must be a finite number above 0, got {scale!r}")
-    return value
+@dataclass(frozen=True)
+class Problem:
+    """B instances of one size, in arrays with a leading batch dimension.
+
+    Attributes:
+        n_agents: m.
+        arrays: NumPy arrays or torch tensors (B, *shape) by their names in ``FIELDS``; ``nodes`` (B, n, 2) always, a
+            world's fields only if the instances have it.
+    """
+
+    n_agents: int
+    arrays: Mapping[str, Array]
+
+    @property
+    def nodes(self) -> Array:
+        """(B, n, 2) float64."""
+        return self.arrays["nodes"]
+
+    @property
+    def n_nodes(self) -> int:
+        """n, the depot included."""
+        return self.nodes.shape[1]
+
+    def instance(self, row: int, name: str = "") -> Instance:
+        """Row ``row`` of a problem of NumPy arrays as an instance."""
+        return Instance(n_agents=self.n_agents, name=name, **{key: array[row] for key, array in self.arrays.items()})
 
 
-def check_nodes(nodes: np.ndarray) -> None:
-    """Raise ValueError unless ``nodes`` (..., n, 2) are at least 2 finite points of the unit square."""
+def batch(instances: Sequence[Instance]) -> Problem:
+    """Instances of one size and with the same world fields as one problem of NumPy arrays.
+
+    Raises:
+        ValueError: no instance, or instances that differ in n, m or the fields of their worlds.
+    """
+    if not instances:
+        raise ValueError("expected at least 1 instance, got none")
+    first = instances[0]
+    for number, other in enumerate(instances):
+        if _shapes(other) != _shapes(first):
+            raise ValueError(f"instance {number} has {_shapes(other)}, instance 0 has {_shapes(first)}")
+    arrays = {name: np.stack([instance.arrays()[name] for instance in instances]) for name in first.arrays()}
+    return Problem(first.n_agents, arrays)
+
+
+def _shapes(instance: Instance) -> dict[str, Any]:
+    return {"n_agents": instance.n_agents, **{name: array.shape for name, array in instance.arrays().items()}}
+
+
+def check_arrays(arrays: Mapping[str, np.ndarray], n_agents: int) -> None:
+    """Raise ValueError unless ``arrays`` (..., *shape), by name, describe problems for ``n_agents`` agents."""
+    for name in arrays:
+        if name not in FIELDS:
+            raise ValueError(f"unknown field {name!r}; choose from {list(FIELDS)}")
+    if "nodes" not in arrays:
+        raise ValueError(f"a problem needs the field 'nodes', got {sorted(arrays)}")
+    nodes = arrays["nodes"]
     if nodes.ndim < 2 or nodes.shape[-1] != 2:
         raise ValueError(f"nodes must have shape (n, 2), got {nodes.shape}")
     check_count("n_nodes", nodes.shape[-2], minimum=2)
-    if not np.isfinite(nodes).all():
-        bad = tuple(int(i) for i in np.argwhere(~np.isfinite(nodes))[0])
-        raise ValueError(f"nodes must be finite, got {nodes[bad]} at {bad}")
-    if nodes.min() < 0 or nodes.max() > 1:
-        raise ValueError(
-            f"nodes must lie in the unit square [0, 1], got a range of [{nodes.min():g}, {nodes.max():g}]; "
-            "from_coordinates(xy, n_agents) brings any coordinates there and keeps the scale"
-        )
+    for name, array in arrays.items():
+        _check_array(name, array, nodes.shape[:-2], nodes.shape[-2], n_agents)
 
 
-def check_count(name: str, value: int, minimum: int) -> None:
-    """Raise ValueError unless ``value`` is a whole number of at least ``minimum``."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < minimum:
-        raise ValueError(f"{name} must be a whole number of at least {minimum}, got {value!r}")
+def _check_array(name: str, array: np.ndarray, lead: tuple[int, ...], n_nodes: int, n_agents: int) -> None:
+    spec = FIELDS[name]
+    sizes = spec.sizes(n_nodes, n_agents)
+    matches = array.ndim == len(lead) + len(sizes) and array.shape[: len(lead)] == lead
+    for size, wanted in zip(array.shape[len(lead) :], sizes, strict=False):
+        matches = matches and (size == wanted if wanted is not None else size >= 1)
+    if not matches:
+        expected = ", ".join(str(size) for size in (*lead, *spec.shape))
+        raise ValueError(f"{name} must have shape ({expected}) with n={n_nodes}, m={n_agents}, got {array.shape}")
+    may_be_infinite = spec.high == math.inf
+    bad = np.isnan(array) if may_be_infinite else ~np.isfinite(array)
+    if bad.any():
+        at = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise ValueError(f"{name} must be {'numbers' if may_be_infinite else 'finite'}, got {array[at]} at {at}")
+    if array.size and not _in_range(spec, array):
+        hint = "; from_coordinates(xy, n_agents) brings any coordinates there and keeps the scale" * (name == "nodes")
+        values = f"a range of [{array.min():g}, {array.max():g}]"
+        raise ValueError(f"{name} must be {_describe_range(spec)}, got {values}{hint}")
+    if spec.zero_at_depot and array[..., 0].any():
+        raise ValueError(f"{name} must be 0 at the depot, got {array[..., 0].max():g}")
+    wrong = spec.check(array) if spec.check else None
+    if wrong is not None:
+        raise ValueError(f"{name}: {wrong}, got {array.tolist()}")
+
+
+def _in_range(spec: ArrayField, array: np.ndarray) -> bool:
+    least, greatest = array.min(), array.max()
+    above = spec.low is None or least > spec.low or (spec.low_allowed and least == spec.low)
+    return bool(above and (spec.high is None or greatest <= spec.high))
+
+
+def _describe_range(spec: ArrayField) -> str:
+    if spec.high is not None and math.isfinite(spec.high):
+        return f"in [{spec.low:g}, {spec.high:g}]"
+    return f"{'at least' if spec.low_allowed else 'above'} {spec.low:g}"
+
+
+def check_plain(problem: Instance | Problem) -> None:
+    """Raise ValueError if the problem has world fields, which this version cannot play or judge."""
+    arrays = problem.arrays() if isinstance(problem, Instance) else problem.arrays
+    world = [name for name in WORLD_FIELDS if name in arrays]
+    if world:
+        raise ValueError(f"only plain problems can be played and judged, this one has the world fields {world}")
 
 
 def from_coordinates(xy: np.ndarray | Sequence, n_agents: int, name: str = "") -> Instance:
-    """Bring any planar coordinates (n, 2) to the unit square, keeping their shape and, in ``scale``, their units.
+    """Bring any planar coordinates (n, 2) to the unit square; ``scale`` keeps their units.
 
     Raises:
         ValueError: fewer than two points, not of shape (n, 2), or not finite.
     """
-    xy = _numbers("coordinates", xy)
+    xy = _as_numbers("coordinates", xy)
     if xy.ndim != 2 or xy.shape[1] != 2:
         raise ValueError(f"coordinates must have shape (n, 2), got {xy.shape}")
     check_count("n_nodes", len(xy), minimum=2)
@@ -127,124 +273,24 @@ def from_coordinates(xy: np.ndarray | Sequence, n_agents: int, name: str = "") -
     return Instance(np.clip((xy - corner) / extent, 0.0, 1.0), n_agents, name, extent)
 
 
-# Distributions: (rng, batch, n_nodes) -> float64 (batch, n_nodes, 2) in the unit square
+def _read_only_copy(name: str, values: object) -> np.ndarray:
+    array = _as_numbers(name, values) + 0.0  # a copy that nobody else can change; -0.0 becomes 0.0
+    array.flags.writeable = False
+    return array
 
 
-def _uniform_nodes(rng: np.random.Generator, batch: int, n_nodes: int) -> np.ndarray:
-    """The paper's distribution (Sec. 6): every node uniform in the unit square."""
-    return rng.random((batch, n_nodes, 2))
-
-
-def _clustered_nodes(rng: np.random.Generator, batch: int, n_nodes: int) -> np.ndarray:
-    """Cities scattered (standard deviation 0.07) around 3 to 8 uniform centres, the depot uniform; the clusters of
-    Uchoa et al. 2017 (CVRP benchmark X) in their simplest form."""
-    centres = rng.random((batch, 8, 2))
-    n_centres = rng.integers(3, 9, size=(batch, 1))
-    which = rng.integers(0, n_centres, size=(batch, n_nodes))
-    nodes = np.take_along_axis(centres, which[..., None], axis=1) + rng.normal(0.0, 0.07, (batch, n_nodes, 2))
-    nodes[:, 0] = rng.random((batch, 2))
-    return 1.0 - np.abs(1.0 - np.abs(nodes) % 2.0)  # fold at the border, where clipping would pile cities up
-
-
-DISTRIBUTIONS: dict[str, Callable[[np.random.Generator, int, int], np.ndarray]] = {
-    "uniform": _uniform_nodes,
-    "clustered": _clustered_nodes,
-}
-
-
-def sample_nodes(distribution: str, rng: np.random.Generator, batch: int, n_nodes: int) -> np.ndarray:
-    """``batch`` fresh instances' nodes, float64 (batch, n_nodes, 2), from the named distribution.
-
-    Raises:
-        ValueError: an unknown distribution, or n_nodes below 2.
-    """
-    check_distribution(distribution)
-    check_count("n_nodes", n_nodes, minimum=2)
-    return DISTRIBUTIONS[distribution](rng, batch, n_nodes)
-
-
-def check_distribution(distribution: str) -> None:
-    """Raise ValueError unless ``distribution`` is a key of DISTRIBUTIONS."""
-    if distribution not in DISTRIBUTIONS:
-        raise ValueError(f"unknown distribution {distribution!r}; choose from {sorted(DISTRIBUTIONS)}")
-
-
-def uniform(rng: np.random.Generator, n_nodes: int, n_agents: int) -> Instance:
-    """An instance with every node uniform in the unit square (paper, Sec. 6)."""
-    return Instance(sample_nodes("uniform", rng, 1, n_nodes)[0], n_agents, f"uniform-{n_nodes}")
-
-
-def clustered(rng: np.random.Generator, n_nodes: int, n_agents: int) -> Instance:
-    """An instance whose cities gather around 3 to 8 centres."""
-    return Instance(sample_nodes("clustered", rng, 1, n_nodes)[0], n_agents, f"clustered-{n_nodes}")
-
-
-# Files of our own: JSON, written to a temporary name and moved, so that a crash leaves the old file whole
-
-
-def write_instance(path: str | os.PathLike, instance: Instance) -> None:
-    """Write an instance as JSON: {"name", "n_agents", "scale", "nodes"}."""
-    _write_json(
-        path,
-        {
-            "name": instance.name,
-            "n_agents": instance.n_agents,
-            "scale": instance.scale,
-            "nodes": instance.nodes.tolist(),
-        },
-    )
-
-
-def read_instance(path: str | os.PathLike, n_agents: int | None = None) -> Instance:
-    """Read what ``write_instance`` wrote; ``n_agents`` replaces the file's.
-
-    Raises:
-        OSError: no such file.
-        ValueError: not such a file, or not a valid instance.
-    """
-    data = _read_json(path, keys=("nodes", "n_agents"))
-    m = data["n_agents"] if n_agents is None else n_agents
+def _as_numbers(name: str, values: object) -> np.ndarray:
     try:
-        return Instance(data["nodes"], m, data.get("name", ""), data.get("scale", 1.0))
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{name} must be an array of numbers, got {type(values).__name__}: {error}") from error
 
 
-def write_tours(path: str | os.PathLike, tours: Tours, **extra: object) -> None:
-    """Write tours as JSON: {"tours": [[0, ..., 0], ...]} and whatever else is worth keeping beside them."""
-    _write_json(path, {"tours": [[int(node) for node in tour] for tour in tours], **extra})
-
-
-def read_tours(path: str | os.PathLike) -> Tours:
-    """Read the tours that ``write_tours`` wrote; ``tours.check_tours`` says whether they solve an instance.
-
-    Raises:
-        OSError: no such file.
-        ValueError: not such a file.
-    """
-    tours = _read_json(path, keys=("tours",))["tours"]
-    if not isinstance(tours, list) or not all(
-        isinstance(tour, list) and all(type(node) is int for node in tour) for tour in tours
-    ):
-        raise ValueError(f"{path}: 'tours' must be a list of lists of node numbers")
-    return tours
-
-
-def _write_json(path: str | os.PathLike, data: dict) -> None:
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+def _check_scale(scale: float) -> float:
     try:
-        temporary.write_text(json.dumps(data), encoding="utf-8")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def _read_json(path: str | os.PathLike, keys: Sequence[str]) -> dict:
-    try:
-        data = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:  # not JSON, not text, or nested without end
-        raise ValueError(f"{path}: not a JSON file ({error})") from error
-    if not isinstance(data, dict) or not set(keys) <= data.keys():
-        raise ValueError(f"{path}: expected a JSON object with the keys {list(keys)}")
-    return data
+        value = float(scale)
+    except (TypeError, ValueError, OverflowError):
+        value = math.nan
+    if isinstance(scale, str) or not (math.isfinite(value) and value > 0):
+        raise ValueError(f"scale must be a finite number above 0, got {scale!r}")
+    return value

@@ -8,33 +8,56 @@ from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium.utils import EzPickle
 from pettingzoo import AECEnv
 from pettingzoo.utils import wrappers
 
 from mtsp_env import rules
-from mtsp_env.instance import Instance, Tours, check_distribution, sample_nodes
+from mtsp_env.distributions import Generator, check_distribution, distribution_name, sample
+from mtsp_env.instance import Instance, Tours, batch
 from mtsp_env.tours import makespan
 
 
 def env(**kwargs: Any) -> AECEnv:
     """``raw_env`` with PettingZoo's checks on the order of calls. Takes the arguments of ``raw_env``."""
-    return wrappers.OrderEnforcingWrapper(raw_env(**kwargs))
+    return _OrderEnforcingWrapper(raw_env(**kwargs))
 
 
-class raw_env(AECEnv, EzPickle):
+class _OrderEnforcingWrapper(wrappers.OrderEnforcingWrapper):
+    """PettingZoo's, whose ``num_agents`` fails before the first reset."""
+
+    @property
+    def num_agents(self) -> int:
+        return self.env.num_agents
+
+
+class raw_env(AECEnv):
     """The MinMax mTSP, one decision at a time.
 
     ``agent_selection`` is the agent that has just arrived. It observes a dict of
 
-    - ``observation``: ``cities`` (n, 2), node coordinates minus its own; ``agents`` (m, 3), every agent's destination
-      minus its own position, and the distance that it still has to go; ``visited`` (n,), the global mask. All float32.
+    - ``observation``: ``cities`` (n, 2) float32, node coordinates minus its own; ``agents`` (m, 3) float32, every
+      agent's destination minus its own position, and the distance that it still has to go; ``visited`` (n,) bool, the
+      global mask; ``agent``, its index, a scalar int64.
     - ``action_mask``: (n,) int8, its legal next nodes. ``env.action_space(agent).sample(mask)`` picks one of them.
 
     Its action is the node to go to next. When every city is visited all agents terminate at once, with the reward
-    -makespan. The last infos hold ``makespan`` (in the unit square; with the penalty where truncated) and ``tours``;
-    with ``reference``, also ``reference_makespan``, of near-optimal tours for the same instance, and ``regret``,
-    ``makespan / reference_makespan - 1``: 0.1 is 10 % longer than need be.
+    -makespan. The last infos hold ``makespan`` (in the unit square; if truncated, with the penalty); with
+    ``reference``, also ``reference_makespan``, of near-optimal tours for the same instance, and ``regret``,
+    ``makespan / reference_makespan - 1``: 0.1 means 10 % longer. ``env.unwrapped.tours`` are the tours, during a game
+    and after it.
+
+    A running game can be copied (``copy.deepcopy``) and pickled; the copy goes on exactly as the original would.
+
+    Rewards: every agent is paid the same. A learner that shares one set of parameters must pay agent i
+    ``env.rewards[i]`` right after i's own ``step``. ``env.last()`` returns what has accumulated since i's last
+    decision. With shaped rewards that includes what the other agents' decisions paid, so summed over all decisions it
+    counts every payment m times. With sparse rewards, both are the same: -makespan at the end.
+
+    The depot rule here is the paper's, "open". ``dan_policy.solve`` plays "final", so that its tours are complete
+    whatever a policy does.
+
+    PettingZoo's ``parallel_to_aec`` and ``aec_to_parallel`` do not fit agents that act one at a time;
+    ``pettingzoo.utils.conversions.turn_based_aec_to_parallel`` does.
 
     Args:
         n_nodes: n, the depot included, at least 2.
@@ -43,11 +66,14 @@ class raw_env(AECEnv, EzPickle):
         depot: "open" (the paper) or "final", see ``mtsp_env.rules.Rules``.
         reward: "sparse" or "shaped", see ``mtsp_env.rules.Rules``.
         max_decisions: truncation, by default after 20 (n + m) decisions.
-        distribution: where instances come from, a key of ``mtsp_env.DISTRIBUTIONS``.
+        distribution: a key of ``mtsp_env.DISTRIBUTIONS``, or a function ``(rng, batch, n_nodes, n_agents) -> dict of
+            arrays``, see ``mtsp_env.distributions``.
         render_mode: None, "rgb_array" or "human" (both need the extra ``render``).
         reference: measure regret. ``mtsp_env.reference.improve`` solves the instance as its first episode ends, with
             its default iterations and seed, so the same instance always has the same ``reference_makespan``: about
             0.1 s at n = 50, 3 s at n = 1000 (extra ``reference``).
+        info_tours: put ``tours`` into the last infos as well. Lists of unequal lengths break the batches of some
+            libraries.
 
     Raises:
         ImportError: ``reference`` without Numba.
@@ -69,27 +95,27 @@ class raw_env(AECEnv, EzPickle):
         depot: rules.Depot = "open",
         reward: rules.Reward = "sparse",
         max_decisions: int | None = None,
-        distribution: str = "uniform",
+        distribution: str | Generator = "uniform",
         render_mode: str | None = None,
         reference: bool = False,
+        info_tours: bool = False,
     ):
-        EzPickle.__init__(
-            self, n_nodes, n_agents, speed, depot, reward, max_decisions, distribution, render_mode, reference
-        )
         super().__init__()
         self.rules = rules.make_rules(n_nodes, n_agents, speed, depot, reward, max_decisions)
         check_distribution(distribution)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"unknown render_mode {render_mode!r}; choose from {self.metadata['render_modes']}")
-        if not isinstance(reference, (bool, np.bool_)):
-            raise ValueError(f"reference must be True or False, got {reference!r}")
+        for name, value in (("reference", reference), ("info_tours", info_tours)):
+            if not isinstance(value, (bool, np.bool_)):
+                raise ValueError(f"{name} must be True or False, got {value!r}")
         if reference:
-            import mtsp_env.reference  # noqa: F401  Numba: only where it is needed, but where it is missing, at once
+            import mtsp_env.reference  # noqa: F401  says at once if Numba is missing
         self.n_nodes, self.n_agents = n_nodes, n_agents
-        self.distribution, self.render_mode, self.reference = distribution, render_mode, reference
+        self.distribution, self.render_mode = distribution, render_mode
+        self.reference, self.info_tours = reference, info_tours
 
         self.possible_agents = [f"agent_{i}" for i in range(n_agents)]
-        self._index = {name: np.array([i]) for i, name in enumerate(self.possible_agents)}  # (B,) = (1,), for the rules
+        self._index = {name: np.array([i]) for i, name in enumerate(self.possible_agents)}  # (B,) with B = 1
         self.observation_spaces = {a: _observation_space(n_nodes, n_agents) for a in self.possible_agents}
         self.action_spaces = {a: spaces.Discrete(n_nodes) for a in self.possible_agents}
         self.state_space = spaces.Box(0.0, np.float32(3e38), (3 * n_nodes + 4 * n_agents,), np.float32)
@@ -98,8 +124,17 @@ class raw_env(AECEnv, EzPickle):
         self._viewer = None
         self.agents: list[str] = []
 
+    @property
+    def num_agents(self) -> int:
+        """m before the first reset and during an episode; 0 once the agents of a finished one have been stepped out."""
+        return len(self.agents) if hasattr(self, "game") else self.n_agents
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the window: copies of a running game go on by themselves."""
+        return {**self.__dict__, "_viewer": None}
+
     def observation_space(self, agent: str) -> spaces.Space:
-        """Dict(observation=Dict(cities, agents, visited), action_mask)."""
+        """Dict(observation=Dict(cities, agents, visited, agent), action_mask)."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Space:
@@ -110,9 +145,13 @@ class raw_env(AECEnv, EzPickle):
         """A fresh instance of the distribution, or ``options["instance"]``; all agents at the depot at tick 0.
 
         Raises:
-            ValueError: the instance has another n or m than this environment.
+            ValueError: an unknown option, or an instance with another n or m than this environment.
         """
-        instance = options.get("instance") if isinstance(options, dict) else None
+        options = {} if options is None else options
+        known = isinstance(options, dict) and options.keys() <= {"instance"}
+        if not known and options != {"options": 1}:  # which PettingZoo's api_test passes
+            raise ValueError(f"options must be a dict with the key 'instance' at most, got {options!r}")
+        instance = options.get("instance")
         if instance is not None and not isinstance(instance, Instance):
             raise ValueError(f"options['instance'] must be an Instance, got {type(instance).__name__}")
         if instance is not None and (instance.n_nodes, instance.n_agents) != (self.n_nodes, self.n_agents):
@@ -123,10 +162,10 @@ class raw_env(AECEnv, EzPickle):
         if seed is not None:
             self._rng = np.random.default_rng(seed)
         if instance is None:
-            nodes = sample_nodes(self.distribution, self._rng, 1, self.n_nodes)[0]
-            instance = Instance(nodes, self.n_agents, self.distribution)
+            drawn = sample(self.distribution, self._rng, 1, self.n_nodes, self.n_agents)
+            instance = drawn.instance(0, distribution_name(self.distribution))
+        self.game = rules.start(batch([instance]))
         self.instance = instance
-        self.game = rules.start(instance.nodes[None], self.n_agents)
         self._legal = None
 
         self.agents = list(self.possible_agents)
@@ -148,7 +187,8 @@ class raw_env(AECEnv, EzPickle):
             "observation": {
                 "cities": seen.cities[0],
                 "agents": seen.agents[0],
-                "visited": seen.visited[0].astype(np.float32),
+                "visited": seen.visited[0],
+                "agent": seen.agent[0],
             },
             "action_mask": seen.action_mask[0].astype(np.int8),
         }
@@ -166,7 +206,7 @@ class raw_env(AECEnv, EzPickle):
         before, self.game = self.game, rules.depart(self.game, self.rules, np.array([action]))
 
         self._cumulative_rewards[self.agent_selection] = 0.0
-        self.agent_selection = self.possible_agents[self.game.agent[0]]
+        self.agent_selection = self.possible_agents[rules.agent_to_decide(self.game)[0]]
         self._legal = None
         terminated = bool(rules.all_visited(self.game)[0])
         truncated = not terminated and int(self.game.decisions[0]) >= self.rules.max_decisions
@@ -179,11 +219,13 @@ class raw_env(AECEnv, EzPickle):
             self.render()
 
     def _end(self, terminated: bool) -> None:
-        """All agents end at once and get the same last info."""
+        """End the episode for all agents at once, with the same last info for each."""
         self.terminations = dict.fromkeys(self.agents, terminated)
         self.truncations = dict.fromkeys(self.agents, not terminated)
         cost = float(rules.final_cost(self.game, self.rules)[0])
-        last = {"makespan": cost, "tours": self.tours}
+        last: dict[str, Any] = {"makespan": cost}
+        if self.info_tours:
+            last["tours"] = self.tours
         if self.reference:
             best = _reference_makespan(self.instance)
             regret = cost / best - 1.0 if best > 0.0 else 0.0  # all nodes in one place: nothing to regret
@@ -193,13 +235,16 @@ class raw_env(AECEnv, EzPickle):
     def _check_action(self, action: int | None) -> int:
         name = self.agent_selection
         try:
-            node = operator.index(action)
-        except TypeError:  # None, a float, an array, ...
-            node = -1
-        if not 0 <= node < self.n_nodes:
+            node = operator.index(action)  # type: ignore[arg-type]
+        except TypeError:
+            raise ValueError(
+                f"{name} must pick a node as a whole number in 0..{self.n_nodes - 1}, got {type(action).__name__} "
+                f"{action!r}"
+            ) from None
+        if isinstance(action, (bool, np.bool_)) or not 0 <= node < self.n_nodes:
             raise ValueError(f"{name} must pick a node in 0..{self.n_nodes - 1}, got {action!r}")
         if self._legal is None:
-            self._legal = rules.legal_actions(self.game, self.rules, self.game.agent)[0]
+            self._legal = rules.legal_actions(self.game, self.rules, self._index[name])[0]
         if not self._legal[node]:
             why = "is not open to it now" if node == 0 else "is visited already"
             raise ValueError(f"{name} may not go to node {node}: it {why}; see action_mask")
@@ -207,22 +252,23 @@ class raw_env(AECEnv, EzPickle):
 
     @property
     def tours(self) -> Tours:
-        """Every agent's tour so far; at the end of the episode each is closed at the depot."""
+        """Every agent's tour so far; once the episode is over, each ends at the depot."""
         over = any(self.terminations.values()) or any(self.truncations.values()) or not self.agents
         return rules.tours(self.game.visits[0], self.game.destination[0], close=over)
 
     @property
     def now(self) -> int:
         """The clock: the tick of the decision at hand."""
-        return int(self.game.ready[0].min())
+        return int(rules.now(self.game)[0])
 
     def state(self) -> np.ndarray:
         """All there is, float32 (3 n + 4 m,): nodes (x, y, visited), agents (destination x, y; g; tour length)."""
         game, m = self.game, self.n_agents
         seen = rules.observe(game, self.rules)
-        per_node = np.concatenate([game.nodes[0], game.visited[0][:, None]], axis=1)
+        nodes = self.instance.nodes
+        per_node = np.concatenate([nodes, game.visited[0][:, None]], axis=1)
         per_agent = np.concatenate(
-            [game.nodes[0][game.destination[0]], seen.agents[0][:, 2:], game.length[0].reshape(m, 1)], axis=1
+            [nodes[game.destination[0]], seen.agents[0][:, 2:], game.length[0].reshape(m, 1)], axis=1
         )
         return np.concatenate([per_node.ravel(), per_agent.ravel()]).astype(np.float32)
 
@@ -247,7 +293,7 @@ class raw_env(AECEnv, EzPickle):
 def _reference_makespan(instance: Instance) -> float:
     from mtsp_env.reference import improve
 
-    return makespan(instance.nodes, improve(instance))
+    return makespan(instance, improve(instance))
 
 
 def _observation_space(n_nodes: int, n_agents: int) -> spaces.Dict:
@@ -260,7 +306,8 @@ def _observation_space(n_nodes: int, n_agents: int) -> spaces.Dict:
                 {
                     "cities": spaces.Box(-1.0, 1.0, (n_nodes, 2), np.float32),
                     "agents": spaces.Box(low, high, dtype=np.float32),
-                    "visited": spaces.Box(0.0, 1.0, (n_nodes,), np.float32),
+                    "visited": spaces.Box(0, 1, (n_nodes,), np.bool_),
+                    "agent": spaces.Discrete(n_agents),
                 }
             ),
             "action_mask": spaces.Box(0, 1, (n_nodes,), np.int8),

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mtsp_env.instance import Instance
-from mtsp_env.tours import tour_lengths
+from mtsp_env.tours import path_lengths
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -172,7 +172,7 @@ class _Picture:
 
     def update(self, tours: Sequence[Sequence[int]]) -> None:
         nodes = self.instance.nodes
-        lengths = tour_lengths(nodes, tours) * self.instance.scale  # (m,)
+        lengths = path_lengths(nodes, tours) * self.instance.scale  # (m,)
         longest = int(lengths.argmax()) if lengths.any() else None
 
         owner = np.full(len(nodes), -1)  # which agent visits a node

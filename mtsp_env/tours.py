@@ -6,18 +6,31 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mtsp_env.instance import Instance, Tours
+from mtsp_env.instance import Instance, Tours, check_plain
 
 
-def tour_lengths(nodes: np.ndarray, tours: Sequence[Sequence[int]]) -> np.ndarray:
-    """Length of each tour, float64 (len(tours),), in the units of ``nodes`` (n, 2)."""
-    nodes = np.asarray(nodes, dtype=np.float64)
-    return np.array([np.linalg.norm(np.diff(nodes[list(tour)], axis=0), axis=1).sum() for tour in tours])
+def path_lengths(nodes: np.ndarray, paths: Sequence[Sequence[int]]) -> np.ndarray:
+    """Length of each path through ``nodes`` (n, 2), float64 (len(paths),); a path is a list of node numbers."""
+    return np.array([np.linalg.norm(np.diff(nodes[list(path)], axis=0), axis=1).sum() for path in paths])
 
 
-def makespan(nodes: np.ndarray, tours: Sequence[Sequence[int]]) -> float:
-    """Length of the longest tour: the paper's objective (Sec. 3), to be small."""
-    return float(tour_lengths(nodes, tours).max(initial=0.0))
+def tour_lengths(instance: Instance, tours: Sequence[Sequence[int]]) -> np.ndarray:
+    """Length of each tour, float64 (len(tours),), in unit-square units; times ``instance.scale`` in the source's.
+
+    Raises:
+        ValueError: the instance is not plain.
+    """
+    check_plain(instance)
+    return path_lengths(instance.nodes, tours)
+
+
+def makespan(instance: Instance, tours: Sequence[Sequence[int]]) -> float:
+    """Length of the longest tour, in unit-square units: the paper's objective (Sec. 3), to be minimised.
+
+    Raises:
+        ValueError: the instance is not plain.
+    """
+    return float(tour_lengths(instance, tours).max(initial=0.0))
 
 
 def check_tours(instance: Instance, tours: Sequence[Sequence[int]]) -> None:
@@ -48,10 +61,13 @@ def check_tours(instance: Instance, tours: Sequence[Sequence[int]]) -> None:
 
 
 def check_prefixes(instance: Instance, prefixes: Sequence[Sequence[int]]) -> Tours:
-    """The beginnings of tours, as lists. Raises ValueError where no tours begin so.
+    """The beginnings of tours, one per agent, as lists of ints.
 
-    One for each agent, as ``rules.tours(..., close=False)`` tells them of a game: [0, 3, 5] went to city 3 and is at or
-    on the way to city 5, [0] has not left yet, [0, 3, 0] is home for good.
+    [0, 3, 5] has visited city 3 and is at city 5 or on its way there, [0] has not left yet, [0, 3, 0] is home for good;
+    ``rules.tours(..., close=False)`` returns a game's tours in this form.
+
+    Raises:
+        ValueError: no tours that solve the instance begin like this.
     """
     prefixes = [[int(node) for node in prefix] for prefix in prefixes]
     if len(prefixes) != instance.n_agents:
@@ -74,7 +90,7 @@ def check_prefixes(instance: Instance, prefixes: Sequence[Sequence[int]]) -> Tou
 
 
 def is_closed(prefix: Sequence[int]) -> bool:
-    """Whether an agent whose tour begins so is home for good."""
+    """Whether an agent whose tour begins with ``prefix`` is home for good."""
     return len(prefix) > 1 and prefix[-1] == 0
 
 
@@ -84,19 +100,20 @@ def _cities(numbers: np.ndarray) -> str:
 
 
 def farthest_trip(nodes: np.ndarray) -> float:
-    """Length of the trip to the city farthest from the depot and back, which no makespan is below; nodes (n, 2)."""
+    """Length of the trip to the city farthest from the depot and back: no makespan is shorter. nodes (n, 2)."""
     nodes = np.asarray(nodes, dtype=np.float64)
     return 2.0 * float(np.linalg.norm(nodes - nodes[0], axis=1).max())
 
 
 def lower_bound(instance: Instance) -> float:
-    """No makespan is below this: the farthest out-and-back trip, or the minimum spanning tree over m where larger.
+    """No makespan is below this: the farthest out-and-back trip, or, if larger, the minimum spanning tree over m.
 
     The m tours together hold a spanning tree of all nodes, so the longest is at least the tree's length over m.
     O(n^2) time, O(n) memory (Prim's algorithm).
     """
+    check_plain(instance)
     nodes = instance.nodes
-    distance = np.linalg.norm(nodes - nodes[0], axis=1)  # (n,) of each node to the tree grown so far
+    distance = np.linalg.norm(nodes - nodes[0], axis=1)  # (n,) from each node to the tree grown so far
     outside = np.ones(len(nodes), dtype=bool)
     outside[0] = False
     tree = 0.0

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from mtsp_env.instance import Instance, check_count, from_coordinates
+from mtsp_env.checks import check_count
+from mtsp_env.instance import Instance, from_coordinates
 
 EARTH_RADIUS = 6378.388  # km, TSPLIB 95's
 EDGE_WEIGHT_TYPES = ("EUC_2D", "CEIL_2D", "ATT", "GEO")

@@ -1,4 +1,4 @@
-"""The command ``mtsp`` as tests give it: refused in this process, or in one of its own."""
+"""The command ``mtsp`` in tests: refused in this process, or run in one of its own."""
 
 import os
 import subprocess
@@ -26,12 +26,21 @@ def refused(capsys, *argv: str) -> str:
 
 def run(*argv: str, missing: Sequence[str] = (), **options) -> subprocess.CompletedProcess:
     """The command as a process of its own, in which importing the ``missing`` modules fails."""
-    code = (
-        "import sys\n"
-        f"sys.modules.update(dict.fromkeys({tuple(missing)}))\n"
-        "from dan_policy.cli import main\n"
-        "sys.exit(main(sys.argv[1:]))\n"
-    )
+    code = f"""
+import sys
+
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name in {tuple(missing)}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+
+sys.meta_path.insert(0, Missing())
+from dan_policy.cli import main
+
+sys.exit(main(sys.argv[1:]))
+"""
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent)}
     options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
     return subprocess.run([sys.executable, "-c", code, *argv], env=environment, text=True, check=False, **options)

@@ -18,6 +18,7 @@ from torchrl.envs.utils import step_mdp
 
 from mtsp_env import Instance, mtsp_v0, rules
 from mtsp_env.batched import BatchedMTSP
+from mtsp_env.instance import Problem
 
 # Games: what is played, and by whom
 
@@ -133,13 +134,13 @@ class RulesFace:
 
     def __init__(self, array: Callable, nodes: np.ndarray, n_agents: int, how: rules.Rules):
         self.array, self.how = array, how
-        self.state = rules.start(array(nodes), n_agents)
+        self.state = rules.start(Problem(n_agents, {"nodes": array(nodes)}))
         self.paid = None
 
     def moments(self) -> list[Moment]:
         state, seen = self.state, rules.observe(self.state, self.how)
-        agent, ready, *seen = map(np.asarray, (state.agent, state.ready, *seen))
-        return [Moment(*row) for row in zip(agent, ready.min(axis=1), *seen, strict=True)]
+        *seen, agent = map(np.asarray, seen)
+        return [Moment(*row) for row in zip(agent, np.asarray(rules.now(state)), *seen, strict=True)]
 
     def step(self, actions: list[int]) -> None:
         before, self.state = self.state, rules.depart(self.state, self.how, self.array(actions))
@@ -177,6 +178,7 @@ class AECFace:
     @staticmethod
     def _moment(env: mtsp_v0.raw_env) -> Moment:
         seen, agent = env.last()[0], env.possible_agents.index(env.agent_selection)
+        assert seen["observation"].pop("agent") == agent
         return Moment(agent, env.now, **seen["observation"], action_mask=seen["action_mask"])
 
     def step(self, actions: list[int]) -> None:
@@ -193,7 +195,7 @@ class AECFace:
 
     def outcomes(self) -> list[tuple[float, list[list[int]]]]:
         infos = [env.infos[env.possible_agents[-1]] for env in self.envs]
-        return [(info["makespan"], info["tours"]) for info in infos]
+        return [(info["makespan"], env.tours) for info, env in zip(infos, self.envs, strict=True)]
 
 
 class BatchedFace:
@@ -204,11 +206,11 @@ class BatchedFace:
     def __init__(self, nodes: np.ndarray, n_agents: int, how: rules.Rules):
         size = nodes.shape[1], n_agents, nodes.shape[:1]
         self.env = BatchedMTSP(*size, how.speed, how.depot, how.reward, how.max_decisions)
-        given = TensorDict({"nodes": torch.tensor(nodes)}, batch_size=nodes.shape[:1])
+        given = TensorDict({"game": {"nodes": torch.tensor(nodes)}}, batch_size=nodes.shape[:1])
         self.td = self.env.reset(given, set_state=True)
 
     def moments(self) -> list[Moment]:
-        columns = [self.td["agent"], self.td["ready"].amin(1)]
+        columns = [self.td["agent"], self.td["game", "ready"].amin(1)]
         columns += [self.td[key] for key in ("cities", "agents", "visited", "action_mask")]
         return [Moment(*row) for row in zip(*(column.numpy() for column in columns), strict=True)]
 

@@ -25,7 +25,7 @@ def row(instance: Instance, tours: Tours, number: int, cell: str = "8x2", table:
         "method": "deals",
         "seconds": 1.0,
         "tours": tours,
-        "makespan": makespan(instance.nodes, tours),
+        "makespan": makespan(instance, tours),
         "versions": {},
         "machine": {},
     }

@@ -72,7 +72,7 @@ def test_gaps_are_to_the_best_known_tours(monkeypatch, places) -> None:
     best.merge(cell, 7, {0: known, 1: known}, places["folder"])
     monkeypatch.setattr(aims, "improve", Fake())
     found = aims.measure(TINY[0], cell, 7, places["out"], places["folder"])
-    gaps = [makespan(x.nodes, BAD) / makespan(x.nodes, known) - 1.0 for x in instances[:2]]
+    gaps = [makespan(x, BAD) / makespan(x, known) - 1.0 for x in instances[:2]]
     assert found.gap == pytest.approx([*gaps, 0.0])
     assert best.read(cell, 7, places["folder"]) == {0: known, 1: known, 2: BAD}  # what is measured is kept, too
     assert found.searched.tolist() == [0.0] * 3
@@ -126,7 +126,7 @@ def test_samples_tell_what_far_longer_runs_take_off_the_best_known_tours(monkeyp
     cell, folder, sampled = TINY[1].cell(20), places["folder"], places["out"].with_name("aims-sample.json")
     instances = cell.instances(7)
     optimal = [improve(instance, iterations=1000) for instance in instances]
-    proved = [makespan(x.nodes, tours) <= lower_bound(x) + 1e-9 for x, tours in zip(instances, optimal, strict=True)]
+    proved = [makespan(x, tours) <= lower_bound(x) + 1e-9 for x, tours in zip(instances, optimal, strict=True)]
     assert 0 < sum(proved) < 17  # at least four are not
     known, better = [[0, *range(1, 6), 0], [0, 0], [0, 0]], [[0, 1, 2, 0], [0, 3, 4, 0], [0, 5, 0]]
     best.merge(cell, 7, {i: optimal[i] if proved[i] else known for i in range(20)}, folder)
@@ -145,7 +145,7 @@ def test_samples_tell_what_far_longer_runs_take_off_the_best_known_tours(monkeyp
     monkeypatch.setattr(aims, "improve", found)
     two = run(2)
     for i in map(int, two):
-        gain = 1.0 - makespan(instances[i].nodes, better) / makespan(instances[i].nodes, known)
+        gain = 1.0 - makespan(instances[i], better) / makespan(instances[i], known)
         assert gain > 0.1 and two[str(i)] == pytest.approx(gain)
         assert best.read(cell, 7, folder)[i] == better
     assert run(2) == two and len(calls) == 2  # none is run twice
@@ -180,8 +180,8 @@ def test_what_samples_show_is_added_for_the_instances_that_are_neither_proved_no
         ({"workers": 0}, "workers must be a whole number of at least 1, got 0"),
         ({"sample": 1}, "sample must be 0 or at least 2, got 1"),
         ({"sample": -2}, "sample must be a whole number of at least 0, got -2"),
-        ({"sample": 2, "sample_seconds": 0.0}, "sample_seconds must be a finite number above 0, got 0.0"),
-        ({"best_seconds": 0.0}, "best_seconds must be a finite number above 0, got 0.0"),
+        ({"sample": 2, "sample_seconds": 0.0}, "sample_seconds must be a finite number of seconds above 0, got 0.0"),
+        ({"best_seconds": 0.0}, "best_seconds must be a finite number of seconds above 0, got 0.0"),
         ({"cells": ("8x2", "9x9")}, r"unknown cell '9x9'; choose from \['8x2', '6x3'\]"),
     ],
 )

@@ -102,9 +102,7 @@ def test_the_search_improves_and_the_check_tells_what_is_proved(tmp_path):
     instances = CELL.instances(7)
     best.merge(CELL, 7, {k: one_agent_does_it_all(i) for k, i in enumerate(instances)}, tmp_path)
     assert best.search(CELL, 7, 0.02, workers=2, folder=tmp_path) == "8x2: 3 of 3 improved"
-    costs = [
-        makespan(i.nodes, tours) for i, tours in zip(instances, best.read(CELL, 7, tmp_path).values(), strict=True)
-    ]
+    costs = [makespan(i, tours) for i, tours in zip(instances, best.read(CELL, 7, tmp_path).values(), strict=True)]
     proved = sum(cost <= lower_bound(i) + 1e-9 for cost, i in zip(costs, instances, strict=True))
     said = f"8x2: 3 of 3 instances, mean {sum(costs) / 3:.4f}, {proved} at the lower bound"
     assert best.check(CELL, 7, tmp_path) == said
@@ -117,7 +115,7 @@ def test_the_kept_best_known_tours_solve_their_instances():
     assert {cell.label for cell, seed in kept if seed == SEED} >= {"50x5", "100x10"}
     for cell, seed in kept:
         for instance, tours in zip(cell.instances(seed), best.read(cell, seed).values(), strict=True):
-            assert makespan(instance.nodes, tours) >= lower_bound(instance) - 1e-9
+            assert makespan(instance, tours) >= lower_bound(instance) - 1e-9
 
 
 def test_the_command_takes_better_tours_and_verifies(tmp_path, monkeypatch, capsys):
@@ -150,7 +148,7 @@ def test_our_solvers_solve_tiny_instances_and_repeat_themselves(name):
         tours = solvers.find(name)(instance, 0.05, 0)
         check_tours(instance, tours)
         again = solvers.find(name)(instance, 0.05, 0)
-        assert makespan(instance.nodes, again) == pytest.approx(makespan(instance.nodes, tours))
+        assert makespan(instance, again) == pytest.approx(makespan(instance, tours))
 
 
 def test_naming_solvers_loads_none_and_each_has_a_file():

@@ -1,4 +1,4 @@
-"""The command ``mtsp``: what it prints and writes, every bad input one line and exit code 2, quick to start."""
+"""The command ``mtsp``: what it prints and writes; every bad input gives one line and exit code 2."""
 
 import json
 from pathlib import Path
@@ -28,7 +28,7 @@ EUROPE = Path(__file__).parent.parent / "examples" / "europe.tsp"
 
 
 class FakeSolve:
-    """Stands where ``dan_policy.solve`` does: deals the cities round, and remembers what it was asked."""
+    """Takes the place of ``dan_policy.solve``: deals the cities out in turn, and keeps the options of its calls."""
 
     def __init__(self):
         self.calls: list[dict] = []
@@ -37,7 +37,7 @@ class FakeSolve:
         self.calls.append(options)
         cities, m = list(range(1, instance.n_nodes)), instance.n_agents
         tours = [[0, *cities[agent::m], 0] for agent in range(m)]
-        return SimpleNamespace(tours=tours, makespan=makespan(instance.nodes, tours), seconds=0.25, method="fake")
+        return SimpleNamespace(tours=tours, makespan=makespan(instance, tours), seconds=0.25, method="fake")
 
 
 @pytest.fixture
@@ -53,19 +53,19 @@ def solver(monkeypatch) -> FakeSolve:
 def test_json_is_the_judges_verdict_in_the_units_of_the_file(folder, solver, capsys) -> None:
     assert main(["solve", "ten.tsp", "--agents", "2", "--json"]) == 0
     printed = capsys.readouterr()
-    found = json.loads(printed.out)
+    record = json.loads(printed.out)
     assert printed.err == ""
-    assert list(found) == [
+    assert list(record) == [
         *("name", "n_nodes", "n_agents", "method", "seconds", "makespan", "lower_bound", "lengths", "tours")
     ]
-    assert (found["name"], found["n_nodes"], found["n_agents"], found["method"]) == ("ten", 7, 2, "fake")
-    assert found["seconds"] == 0.25
-    assert found["tours"] == [[0, 1, 3, 5, 0], [0, 2, 4, 6, 0]]
+    assert (record["name"], record["n_nodes"], record["n_agents"], record["method"]) == ("ten", 7, 2, "fake")
+    assert record["seconds"] == 0.25
+    assert record["tours"] == [[0, 1, 3, 5, 0], [0, 2, 4, 6, 0]]
     across, side, diagonal = 50**0.5, 5.0, 10 * 1.25**0.5  # half a diagonal; half a side; corner to far middle
     by_hand = [across + side + diagonal + across, side + 10.0 + across + side]
-    assert found["lengths"] == pytest.approx(by_hand)
-    assert found["makespan"] == pytest.approx(max(by_hand))
-    assert found["lower_bound"] == pytest.approx(15.0)
+    assert record["lengths"] == pytest.approx(by_hand)
+    assert record["makespan"] == pytest.approx(max(by_hand))
+    assert record["lower_bound"] == pytest.approx(15.0)
     assert solver.calls == [
         {
             "policy": "default",
@@ -102,7 +102,7 @@ def test_options_reach_the_solver(folder, solver) -> None:
 
 @pytest.fixture
 def improved(monkeypatch) -> list[dict]:
-    """What the reference solver was asked, in a search that takes no time."""
+    """The options of calls to the reference solver, whose search takes no time."""
     reference, calls = pytest.importorskip("mtsp_env.reference", reason="needs the extra reference"), []
 
     def improve(instance: Instance, **options) -> list[list[int]]:
@@ -119,10 +119,10 @@ def test_the_reference_solves_in_the_policys_place(folder, solver, improved, cap
     assert improved == [{"seconds": None, "seed": 0}] * 2 + [{"seconds": 1.5, "seed": 8}]
     assert solver.calls == []
     for line in capsys.readouterr().out.splitlines():
-        found = json.loads(line)
-        assert found["method"] == "reference"
-        assert found["tours"] == [[0, 1, 2, 3, 4, 5, 6, 0], [0, 0]]
-        assert found["seconds"] > 0
+        record = json.loads(line)
+        assert record["method"] == "reference"
+        assert record["tours"] == [[0, 1, 2, 3, 4, 5, 6, 0], [0, 0]]
+        assert record["seconds"] > 0
 
 
 def test_agents_of_a_json_file_are_its_own_unless_given(folder, solver, capsys) -> None:
@@ -169,9 +169,9 @@ def test_all_nodes_in_one_place_and_idle_agents(folder, solver, capsys) -> None:
 
 def test_files_hold_what_was_printed(folder, solver, capsys) -> None:
     assert main(["solve", "ten.tsp", "--agents", "2", "--json", "--out", "tours.json", "--plot", "tours.svg"]) == 0
-    found = json.loads(capsys.readouterr().out)  # and nothing else
-    assert json.loads(Path("tours.json").read_text()) == found
-    assert read_tours("tours.json") == found["tours"]
+    record = json.loads(capsys.readouterr().out)  # and nothing else
+    assert json.loads(Path("tours.json").read_text()) == record
+    assert read_tours("tours.json") == record["tours"]
     assert Path("tours.svg").read_bytes().startswith(b"<?xml")
 
 
@@ -211,7 +211,10 @@ def test_it_says_where_the_files_are(folder, solver, capsys) -> None:
         ("square.json --agents 2.5", "got '2.5'"),
         ("square.json --decode sample --samples -3", "--samples: must be a whole number of at least 1, got '-3'"),
         ("square.json --samples 3", "--samples needs --decode sample"),
-        ("square.json --method lkh", "invalid choice: 'lkh'"),
+        (
+            "square.json --method lkh",
+            "invalid choice 'lkh' for argument '--method'",
+        ),
         ("square.json --improve 0", "--improve: must be a finite number of seconds above 0, got '0'"),
         ("square.json --improve inf", "must be a finite number of seconds above 0, got 'inf'"),
         ("square.json --improve soon", "must be a finite number of seconds above 0, got 'soon'"),
@@ -224,14 +227,17 @@ def test_it_says_where_the_files_are(folder, solver, capsys) -> None:
         ("square.json --method reference --device cpu", "--device needs --method dan"),
         ("square.json --seed -1", "--seed: must be a whole number of at least 0, got '-1'"),
         ("square.json --seed 9223372036854775808", "--seed: must be"),
-        ("square.json --decode beam", "invalid choice: 'beam'"),
+        ("square.json --decode beam", "invalid choice 'beam' for argument '--decode'"),
         ("square.json --plot t.xyz", "t.xyz: unknown picture suffix 'xyz'"),
         ("square.json --plot nowhere/t.png", "nowhere/t.png: no such folder"),
         ("square.json --out nowhere/t.json", "nowhere/t.json: no such folder"),
         ("square.json --out square.json", "square.json: would overwrite another file of this command"),
         ("square.json --out t.svg --plot ./t.svg", "t.svg: would overwrite another file of this command"),
         ("", "required: FILE"),
-        ("square.json --sample 3", "unrecognized arguments: --sample"),
+        ("square.json --sample 3", "Unrecognized options: --sample, 3"),
+        ("square.json --agents", "Missing value for argument '--agents'"),
+        ("square.json --method reference --network mine:net", "--network needs --method dan"),
+        ("square.json --network nowhere_at_all:net", "No module named 'nowhere_at_all'"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_solved(folder, solver, capsys, argv: str, message: str) -> None:
@@ -307,10 +313,13 @@ def test_generate_defaults_are_the_papers(folder) -> None:
         ("--nodes 1 --agents 2 a.json", "--nodes: must be a whole number of at least 2, got '1'"),
         ("--nodes 5 --agents 0 a.json", "--agents: must be a whole number of at least 1, got '0'"),
         ("--nodes 5 --agents 2 --seed -1 a.json", "--seed: must be a whole number of at least 0"),
-        ("--nodes 5 --agents 2 --distribution ring a.json", "invalid choice: 'ring'"),
+        (
+            "--nodes 5 --agents 2 --distribution ring a.json",
+            "unknown distribution 'ring'; choose from",
+        ),
         ("--nodes 5 --agents 2 a.tsp", "a.tsp: unknown suffix '.tsp'; choose from ['.json']"),
         ("--nodes 5 --agents 2 nowhere/a.json", "nowhere/a.json: cannot write it (No such file or directory)"),
-        ("--agents 2 a.json", "required: --nodes"),
+        ("--agents 2 a.json", "Missing from mtsp generate: --nodes N"),
     ],
 )
 def test_generate_refuses(folder, capsys, argv: str, message: str) -> None:
@@ -331,5 +340,5 @@ def test_version_and_help(capsys) -> None:
 
 
 def test_no_command_or_an_unknown_one(capsys) -> None:
-    assert "required: COMMAND" in refused(capsys)
-    assert "invalid choice: 'sovle'" in refused(capsys, "sovle")
+    assert "Expected one of {solve, generate}" in refused(capsys)
+    assert "Unrecognized options: sovle" in refused(capsys, "sovle")

@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -29,14 +31,28 @@ def test_only_solving_imports_what_is_heavy(tmp_path) -> None:
     assert 'pip install "mtsp-env[dan]"' in solved.stderr
 
 
+def test_without_tyro_the_command_names_the_extra() -> None:
+    done = run("--help", missing=["tyro"])
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("mtsp: error: the command needs tyro")
+    assert 'pip install "mtsp-env[dan]"' in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_help_needs_nothing_heavy() -> None:
+    for argv in (["--help"], ["solve", "--help"], ["generate", "--help"]):
+        done = run(*argv, missing=(*TORCH, "matplotlib", "numba", "rich", "vrplib", "scipy"))
+        assert (done.returncode, done.stderr) == (0, "")
+        assert "usage: mtsp" in done.stdout and "example" in done.stdout
+
+
 def test_the_reference_alone_needs_no_torch(folder, square: Instance) -> None:
     pytest.importorskip("numba", reason="needs the extra reference")
     argv = ("solve", "square.json", "--method", "reference", "--seed", "3")
     done = run(*argv, "--json", missing=(*TORCH, "rich"))
     assert (done.returncode, done.stderr) == (0, "")
-    found = json.loads(done.stdout)
-    check_tours(square, found["tours"])
-    assert (found["makespan"], found["method"]) == (2.0, "reference")
+    record = json.loads(done.stdout)
+    check_tours(square, record["tours"])
+    assert (record["makespan"], record["method"]) == (2.0, "reference")
     without_rich, without_numba = (run(*argv, missing=(*TORCH, name)) for name in ("rich", "numba"))
     assert (without_rich.returncode, without_numba.returncode) == (2, 2)
     assert without_rich.stderr.startswith("mtsp: error: the table needs rich")
@@ -46,7 +62,7 @@ def test_the_reference_alone_needs_no_torch(folder, square: Instance) -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="pipes break differently there")
-def test_a_reader_that_has_seen_enough_is_no_error(tmp_path) -> None:
+def test_a_reader_that_closes_the_pipe_is_no_error(tmp_path) -> None:
     reader, writer = os.pipe()
     os.close(reader)
     argv = ("generate", "--nodes", "5", "--agents", "2", str(tmp_path / "a.json"))
@@ -56,7 +72,7 @@ def test_a_reader_that_has_seen_enough_is_no_error(tmp_path) -> None:
 
 
 def test_solves_with_a_policy_from_a_file(folder, capsys) -> None:
-    """No fake here: an untrained network plans tours that the judge accepts."""
+    """Nothing is faked: an untrained network plans tours that the judge accepts."""
     pytest.importorskip("torchrl", reason="needs the extra dan")
     network = dan_policy.DAN(dan_policy.DANConfig(embed_dim=16, feedforward_dim=16, n_heads=2, city_layers=1))
     dan_policy.save("mine.safetensors", network)
@@ -64,10 +80,10 @@ def test_solves_with_a_policy_from_a_file(folder, capsys) -> None:
     for options in ("", "--decode sample --samples 4 --seed 1"):
         argv = ["solve", str(EUROPE), "--agents", "3", "--policy", "mine.safetensors", "--json", *options.split()]
         assert main(argv) == 0
-        found = json.loads(capsys.readouterr().out)
-        check_tours(instance, found["tours"])
-        assert found["makespan"] == pytest.approx(makespan(instance.nodes, found["tours"]) * instance.scale)
-        assert found["lower_bound"] == lower_bound(instance) * instance.scale <= found["makespan"]
+        record = json.loads(capsys.readouterr().out)
+        check_tours(instance, record["tours"])
+        assert record["makespan"] == pytest.approx(makespan(instance, record["tours"]) * instance.scale)
+        assert record["lower_bound"] == lower_bound(instance) * instance.scale <= record["makespan"]
 
 
 @pytest.mark.parametrize(
@@ -84,3 +100,69 @@ def test_the_real_solver_refuses_in_one_line(folder, capsys, options: str, messa
     network = dan_policy.DAN(dan_policy.DANConfig(embed_dim=16, feedforward_dim=16, n_heads=2, city_layers=1))
     dan_policy.save("mine.safetensors", network)
     assert message in refused(capsys, "solve", "square.json", *options.split())
+
+
+OWN = """
+import torch
+from torch import nn
+
+
+class Polar(nn.Module):
+    in_keys = ("cities", ("game", "home"))
+
+    def __init__(self, width=4):
+        super().__init__()
+        self.layers = nn.Sequential(nn.Linear(3, width), nn.Tanh(), nn.Linear(width, 1))
+
+    def forward(self, cities, home):
+        x, y = cities.unbind(-1)
+        polar = torch.stack([torch.hypot(x, y), torch.atan2(y, x), home.to(x.dtype)], dim=-1)
+        return self.layers(polar)[..., 0]
+
+
+def nearest(cities):
+    return -cities.norm(dim=-1)
+
+
+nearest.in_keys = ("cities",)
+
+
+def make_nearest():
+    return nearest
+"""
+
+
+def test_a_network_of_ones_own_solves_from_a_directory_outside_the_checkout(folder) -> None:
+    """A module with its weights in a file, and a plain function, both from a file in the working directory."""
+    Path("own_networks.py").write_text(OWN)
+    made = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "import dan_policy as d\n"
+            "n = d.build('own_networks:Polar', {'width': 3})\n"
+            "d.save('own.safetensors', n, 'own_networks:Polar', {'width': 3})\n"
+            "n = d.load('own.safetensors', network='own_networks:Polar')\n"
+            "i = __import__('mtsp_env').read_tsplib('ten.tsp', 2)\n"
+            "print(d.solve(i, n, device='cpu').tours)",
+        ],
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    argv = ("solve", "ten.tsp", "--agents", "2", "--json")
+    own = run(*argv, "--policy", "own.safetensors", "--network", "own_networks:Polar")
+    assert (own.returncode, own.stderr) == (0, "")
+    record = json.loads(own.stdout)
+    check_tours(read_tsplib("ten.tsp", 2), record["tours"])
+    assert record["tours"] == json.loads(made.stdout) and record["method"] == "Polar(g.)"
+
+    function = run(*argv, "--network", "own_networks:make_nearest", "--decode", "sample", "--samples", "3")
+    assert (function.returncode, function.stderr) == (0, "")
+    check_tours(read_tsplib("ten.tsp", 2), json.loads(function.stdout)["tours"])
+    assert json.loads(function.stdout)["method"] == "nearest(s.3)"
+
+    refused = run(*argv, "--policy", "own.safetensors")
+    assert refused.returncode == 2 and refused.stderr.count("\n") == 1
+    assert "names the factory 'own_networks:Polar': give the network" in refused.stderr

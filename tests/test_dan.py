@@ -112,15 +112,15 @@ def test_the_glimpse_ignores_visited_cities_and_pruning_forgets_them():
 
 
 def test_bfloat16_pads_to_a_few_lengths():
-    """A kernel is built for each shape: lengths are few, no shorter than asked for and at most 12.5 % longer."""
+    """A kernel is built for each shape, so lengths are rounded up to a few, which are at most 12.5 % longer."""
     rounded = {length: layers.padded_length(length) for length in range(1, 1025)}
     assert all(length <= longer for length, longer in rounded.items())
     assert all(longer - length < max(8, length / 8) for length, longer in rounded.items())
     assert len(set(rounded.values())) == 40
 
 
-def test_what_bfloat16_pads_with_is_not_seen(monkeypatch):
-    """Under autocast rows are longer than their open nodes; the logits are those of rows that are not."""
+def test_the_padding_of_bfloat16_is_not_seen(monkeypatch):
+    """Under autocast, rows are longer than their open nodes; the logits are those of unpadded rows."""
     network, (cities, agents, visited) = DAN(CONFIGS["pruned"]).eval(), observation(n=30)
     visited[:, 11:] = True
     lengths, logits = [], DAN._logits
@@ -178,8 +178,8 @@ def test_bad_configurations_are_named(kwargs, message):
         DANConfig(**kwargs)
 
 
-def test_who_sees_a_few_cities_sees_the_nearest_unvisited_ones():
-    """As if the others were not there; those get the least logit, so that they stay legal."""
+def test_a_view_shows_the_nearest_unvisited_cities():
+    """As if there were no others; those get the smallest logit, and stay legal."""
     cities, agents, visited = observation(n=30)
     torch.manual_seed(0)
     network = DAN(replace(SMALL, prune_visited=True, view=6))

@@ -23,7 +23,7 @@ from mtsp_env import (
     write_instance,
     write_tours,
 )
-from mtsp_env.instance import sample_nodes
+from mtsp_env.distributions import sample
 
 PAIR = [[0.0, 0.0], [1.0, 1.0]]
 HUGE = 10**400  # too large for a float
@@ -47,8 +47,8 @@ instances = st.builds(
         ({"nodes": [0.0, 1.0]}, r"shape \(n, 2\), got \(2,\)"),
         ({"nodes": [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]}, r"shape \(n, 2\), got \(2, 3\)"),
         ({"nodes": [[PAIR, PAIR]]}, r"shape \(n, 2\)"),
-        ({"nodes": [[0.0, 0.0], [1.0]]}, r"numbers of shape \(n, 2\)"),
-        ({"nodes": "nodes"}, r"numbers of shape \(n, 2\), got str"),
+        ({"nodes": [[0.0, 0.0], [1.0]]}, "nodes must be an array of numbers"),
+        ({"nodes": "nodes"}, "nodes must be an array of numbers, got str"),
         ({"nodes": [[0, 0], [HUGE, 1]]}, "nodes must be"),
         ({"nodes": [[0.0, 0.0], [1.0, math.nan]]}, r"finite, got nan at \(1, 1\)"),
         ({"nodes": [[0.0, -math.inf], [1.0, 1.0]]}, r"finite, got -inf at \(0, 1\)"),
@@ -157,7 +157,7 @@ def test_samples_lie_in_the_unit_square_and_follow_the_seed(
     distribution: str, seed: int, batch: int, n_nodes: int
 ) -> None:
     nodes, again, other = (
-        sample_nodes(distribution, np.random.default_rng(s), batch, n_nodes) for s in (seed, seed, seed + 1)
+        sample(distribution, np.random.default_rng(s), batch, n_nodes, 2).nodes for s in (seed, seed, seed + 1)
     )
     assert nodes.shape == (batch, n_nodes, 2)
     assert nodes.dtype == np.float64
@@ -169,7 +169,7 @@ def test_samples_lie_in_the_unit_square_and_follow_the_seed(
 @pytest.mark.parametrize("distribution", DISTRIBUTIONS)
 def test_every_node_is_uniform_on_its_own(distribution: str) -> None:
     """Clusters too: a uniform centre, shifted by the same noise either way and folded at the border, stays uniform."""
-    nodes = sample_nodes(distribution, np.random.default_rng(0), 40_000, 3)
+    nodes = sample(distribution, np.random.default_rng(0), 40_000, 3, 2).nodes
     np.testing.assert_allclose(nodes.mean(axis=0), 1 / 2, atol=0.006)  # four standard errors
     np.testing.assert_allclose(nodes.var(axis=0), 1 / 12, atol=0.002)
     corner = (nodes < 0.1).all(axis=2).mean(axis=0)
@@ -180,7 +180,7 @@ def test_uniform_nodes_are_independent_and_clustered_cities_are_not() -> None:
     """Two clustered cities share one of k centres, k uniform in 3 to 8, with probability mean(1/k) = 0.203; then their
     coordinates correlate as a centre plus noise of standard deviation 0.07 does, 1 / (1 + 12 * 0.07^2) = 0.944."""
     for distribution, expected in (("uniform", 0.0), ("clustered", 0.203 * 0.944)):
-        nodes = sample_nodes(distribution, np.random.default_rng(1), 40_000, 3)
+        nodes = sample(distribution, np.random.default_rng(1), 40_000, 3, 2).nodes
         for axis in (0, 1):
             depot, one, other = nodes[:, :, axis].T
             assert np.corrcoef(one, other)[0, 1] == pytest.approx(expected, abs=0.02), distribution
@@ -191,14 +191,14 @@ def test_uniform_nodes_are_independent_and_clustered_cities_are_not() -> None:
 @pytest.mark.parametrize(("make", "distribution"), [(uniform, "uniform"), (clustered, "clustered")])
 def test_one_instance_is_a_batch_of_one(make, distribution: str) -> None:
     instance = make(np.random.default_rng(3), n_nodes=20, n_agents=4)
-    assert instance.nodes.tolist() == sample_nodes(distribution, np.random.default_rng(3), 1, 20)[0].tolist()
+    assert instance.nodes.tolist() == sample(distribution, np.random.default_rng(3), 1, 20, 4).nodes[0].tolist()
     assert (instance.n_nodes, instance.n_agents, instance.scale) == (20, 4, 1.0)
 
 
 def test_bad_samples_are_refused() -> None:
     rng = np.random.default_rng(0)
     with pytest.raises(ValueError, match=r"unknown distribution 'ring'; choose from \['clustered', 'uniform'\]"):
-        sample_nodes("ring", rng, 1, 5)
+        sample("ring", rng, 1, 5, 2)
     with pytest.raises(ValueError, match=r"n_nodes must be .* at least 2, got 1"):
         uniform(rng, 1, 2)
     with pytest.raises(ValueError, match=r"n_agents must be .* at least 1, got 0"):

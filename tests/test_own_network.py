@@ -13,9 +13,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from dan_policy import load, make_actor, solve
+from dan_policy import build, load, make_actor, save, solve
 from dan_policy.registry import load_config
 from mtsp_env import check_tours, read_tsplib
+from train.__main__ import main
 from train.validate import validate
 
 ROOT = Path(__file__).parent.parent
@@ -59,7 +60,7 @@ def test_it_is_trained_validated_and_solves(folder):
     size = "--n-nodes 8 10 --n-agents 2 2 --nodes-per-agent 2"
     run(
         f"python -m train imitate --policy mynet:make --policy-options layers 1 embed_dim 16 {size} --steps 3 "
-        "--set-tokens 100 --buffer 4 --teacher-iterations 5 --warmup 1 --average 0 --validate-every 3 "
+        "--set-tokens 100 --buffer 4 --workers 0 --teacher-iterations 5 --warmup 1 --average 0 --validate-every 3 "
         "--validation-instances 8 --out runs/mynet --no-tensorboard"
     )
     file = Path("runs/mynet/best.safetensors")
@@ -69,26 +70,21 @@ def test_it_is_trained_validated_and_solves(folder):
     assert float(printed.split()[0]) == pytest.approx(cost, abs=1e-4)
     check_solves_europe(file)
 
-    run(f"python -m train average {file} runs/mynet/last.safetensors --network mynet:make --out mean.safetensors")
+    assert main(["average", str(file), str(file), "--network", "mynet:make", "--out", "mean.safetensors"]) == 0
     assert load_config("mean.safetensors") == load_config(file)
     mean, best = (load(one, network="mynet:make").state_dict() for one in ("mean.safetensors", file))
-    assert all(torch.allclose(mean[name], weight, atol=1e-6) for name, weight in best.items())  # best is last here
+    assert all(torch.allclose(mean[name], weight, atol=1e-6) for name, weight in best.items())
 
 
 def test_a_weights_file_does_not_decide_which_code_is_imported(folder):
-    from mynet import make
-
-    from dan_policy import save
-
-    save("mynet.safetensors", make(), "mynet:make")
+    save("mynet.safetensors", build("mynet:make"), "mynet:make")
     with pytest.raises(ValueError, match="names the factory 'mynet:make'"):
         load("mynet.safetensors")
 
 
 def test_it_sees_distances_and_angles_alone(folder):
     """A turned map gives other angles but the same distances; a network of distances alone would not notice."""
-    from mynet import polar
-
+    polar = sys.modules[type(build("mynet:make")).__module__].polar
     points = torch.tensor([[1.0, 0.0], [0.0, 2.0], [-3.0, 0.0]])
     expected = torch.tensor([[1.0, 1.0, 0.0], [2.0, 0.0, 1.0], [3.0, -1.0, 0.0]])
     torch.testing.assert_close(polar(points), expected, atol=1e-6, rtol=0)
@@ -96,9 +92,7 @@ def test_it_sees_distances_and_angles_alone(folder):
 
 
 def test_leading_dimensions_are_free_and_the_actor_reads_its_keys(folder):
-    from mynet import make
-
-    network = make(embed_dim=16, layers=1).eval()
+    network = build("mynet:make", {"embed_dim": 16, "layers": 1}).eval()
     assert make_actor(network).in_keys[:4] == ["cities", "agents", "visited", "agent"]
     observation = (torch.rand(6, 9, 2), torch.rand(6, 3, 3), torch.zeros(6, 9, dtype=torch.bool), torch.arange(6) % 3)
     flat = network(*observation)

@@ -8,9 +8,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mtsp_env import Instance, check_tours, makespan, rules, tour_lengths
+from mtsp_env import Instance, check_tours, makespan, rules
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.instance import Tours
+from mtsp_env.tours import path_lengths
 
 pytest.importorskip("numba", reason="needs the extra reference")
 from mtsp_env.reference import improve, improve_batch
@@ -46,7 +47,7 @@ def completions(instance: Instance, prefixes: Tours) -> float:
             tours = [list(prefix) for prefix in prefixes]
             for city, agent in zip(order, agents, strict=True):
                 tours[agent].append(city)
-            best = min(best, makespan(instance.nodes, [[*tour, 0] for tour in tours]))
+            best = min(best, makespan(instance, [[*tour, 0] for tour in tours]))
     return best
 
 
@@ -60,7 +61,7 @@ def test_tours_begin_with_the_prefixes_and_are_never_made_worse(case, iterations
         assert tour[: len(prefix)] == prefix
         assert tour == prefix or len(prefix) == 1 or prefix[-1] != 0  # closed ones stay so
     if start:
-        assert makespan(instance.nodes, found) <= makespan(instance.nodes, tours)
+        assert makespan(instance, found) <= makespan(instance, tours)
 
 
 @given(begun(most=7))
@@ -68,7 +69,7 @@ def test_tours_begin_with_the_prefixes_and_are_never_made_worse(case, iterations
 def test_small_teams_are_completed_as_well_as_can_be(case) -> None:
     instance, prefixes, _ = case
     found = improve(instance, iterations=2000, prefixes=prefixes)
-    assert makespan(instance.nodes, found) == pytest.approx(completions(instance, prefixes), abs=1e-9)
+    assert makespan(instance, found) == pytest.approx(completions(instance, prefixes), abs=1e-9)
 
 
 @pytest.mark.parametrize("tidy", [False, True])
@@ -84,7 +85,7 @@ def test_a_plan_is_still_near_optimal_when_its_beginning_is_fixed() -> None:
     plan = improve(instance, iterations=30_000)
     prefixes = [tour[: len(tour) // 3] for tour in plan]
     again = improve(instance, iterations=10_000, prefixes=prefixes)
-    assert makespan(instance.nodes, again) <= 1.01 * makespan(instance.nodes, plan)
+    assert makespan(instance, again) <= 1.01 * makespan(instance, plan)
     with pytest.raises(ValueError, match="tour 0 must begin with its prefix"):
         improve(instance, plan, prefixes=[list(reversed(plan[0]))[:3], *prefixes[1:]])
 
@@ -94,16 +95,16 @@ def test_games_are_finished_from_any_moment() -> None:
     env = BatchedMTSP(12, 3, [16], 0.1, depot="final", seed=0)
     torch.manual_seed(0)
     td = env.reset()
-    nodes = td["nodes"].numpy()
+    nodes = td["game", "nodes"].numpy()
     for _ in range(14):
-        states = zip(td["visits"].numpy(), td["destination"].numpy(), strict=True)
+        states = zip(td["game", "visits"].numpy(), td["game", "destination"].numpy(), strict=True)
         prefixes = [rules.tours(*state, close=False) for state in states]
         found = improve_batch(nodes, 3, 100, prefixes=prefixes)
         for row, tours, begun_ in zip(nodes, found, prefixes, strict=True):
             check_tours(Instance(row, 3), tours)
             assert all(tour[: len(prefix)] == prefix for tour, prefix in zip(tours, begun_, strict=True))
         td = env.step(env.rand_action(td))["next"]
-    driven = tour_lengths(nodes[0], prefixes[0])
+    driven = path_lengths(nodes[0], prefixes[0])
     assert (driven > 0).all()
 
 

@@ -15,10 +15,12 @@ from hypothesis import strategies as st
 
 from mtsp_env import Instance, check_tours, clustered, lower_bound, makespan, tour_lengths, uniform
 from mtsp_env.instance import Tours
+from mtsp_env.tours import path_lengths
 
 pytest.importorskip("numba", reason="needs the extra reference")
-from mtsp_env import _search, _sisr, reference
-from mtsp_env.reference import COLD, HOT, improve, improve_batch
+from mtsp_env.reference import improve, improve_batch, sisr, solver
+from mtsp_env.reference import search as search_arrays
+from mtsp_env.reference.solver import COLD, HOT
 
 ROOT = Path(__file__).parents[1]
 
@@ -49,7 +51,7 @@ def inserted_greedily(instance: Instance) -> Tours:
     tours = [[0, 0] for _ in range(instance.n_agents)]
     for city in sorted(range(1, instance.n_nodes), key=lambda city: -math.dist(nodes[0], nodes[city])):
         ways = [(a, [*tour[:i], city, *tour[i:]]) for a, tour in enumerate(tours) for i in range(1, len(tour))]
-        agent, tour = min(ways, key=lambda way: tour_lengths(nodes, [way[1]])[0])
+        agent, tour = min(ways, key=lambda way: path_lengths(nodes, [way[1]])[0])
         tours[agent] = tour
     return tours
 
@@ -71,16 +73,16 @@ def instances_and_tours(draw: st.DrawFn) -> tuple[Instance, Tours]:
 @pytest.fixture
 def turns(monkeypatch) -> list[tuple[int, float, float]]:
     """The calls of the annealing kernel: iterations, first and last temperature. Each iteration takes 0.1 ms."""
-    calls, anneal = [], _sisr.anneal
-    reference.compile_kernels()
+    calls, anneal = [], sisr.anneal
+    solver.compile_kernels()
 
     def noted(search, iterations, hot, cold, *goal):
         calls.append((iterations, hot, cold))
         return anneal(search, iterations, hot, cold, *goal)
 
     clock = SimpleNamespace(perf_counter=lambda: 5.0 + 1e-4 * sum(iterations for iterations, _, _ in calls))
-    monkeypatch.setattr(_sisr, "anneal", noted)
-    monkeypatch.setattr(reference, "time", clock)
+    monkeypatch.setattr(sisr, "anneal", noted)
+    monkeypatch.setattr(solver, "time", clock)
     return calls
 
 
@@ -89,7 +91,7 @@ def turns(monkeypatch) -> list[tuple[int, float, float]]:
 
 def test_square_by_hand(square: Instance) -> None:
     tours = improve(square, iterations=1000)
-    assert makespan(square.nodes, tours) == 2.0
+    assert makespan(square, tours) == 2.0
     assert sorted(sorted(tour[1:-1]) for tour in tours) == [[1, 2, 3], [4, 5, 6]]
 
 
@@ -99,16 +101,16 @@ def test_small_instances_are_solved_to_the_optimum(n_nodes: int, n_agents: int) 
     rng = np.random.default_rng([n_nodes, n_agents])
     for make in (uniform, clustered):
         instance = make(rng, n_nodes, n_agents)
-        assert makespan(instance.nodes, improve(instance, iterations=1000)) == pytest.approx(
-            optimum(instance), abs=1e-9
-        )
+        assert makespan(instance, improve(instance, iterations=1000)) == pytest.approx(optimum(instance), abs=1e-9)
 
 
 def test_a_few_milliseconds_are_nearly_enough() -> None:
     """n = 50, m = 5: 2000 iterations stay within 1 % of 20,000, on average; greedy insertion does not within 15 %."""
     nodes = np.random.default_rng(0).random((12, 50, 2))
     start, short, long = (
-        np.mean([makespan(row, tours) for row, tours in zip(nodes, improve_batch(nodes, 5, k), strict=True)])
+        np.mean(
+            [makespan(Instance(row, 5), tours) for row, tours in zip(nodes, improve_batch(nodes, 5, k), strict=True)]
+        )
         for k in (0, 2000, 20000)
     )
     assert long <= short < 1.01 * long
@@ -140,7 +142,7 @@ def test_no_iterations_leave_greedy_insertion() -> None:
 def test_tours_are_valid(instance: Instance, iterations: int, seed: int) -> None:
     tours = improve(instance, iterations=iterations, seed=seed)
     check_tours(instance, tours)
-    assert makespan(instance.nodes, tours) >= lower_bound(instance) - 1e-9
+    assert makespan(instance, tours) >= lower_bound(instance) - 1e-9
     assert all(0 not in tour[1:-1] and all(type(node) is int for node in tour) for tour in tours)
 
 
@@ -151,7 +153,7 @@ def test_given_tours_are_never_made_worse(problem: tuple[Instance, Tours], itera
     before = copy.deepcopy(tours)
     improved = improve(instance, tours, iterations=iterations)
     check_tours(instance, improved)
-    assert makespan(instance.nodes, improved) <= makespan(instance.nodes, tours)
+    assert makespan(instance, improved) <= makespan(instance, tours)
     assert tours == before
 
 
@@ -170,10 +172,10 @@ def test_the_search_starts_from_the_given_tours_or_greedy_insertion(monkeypatch)
     instance, starts = random_instance(3, 60, 3), []
     good, greedy = improve(instance, iterations=1000), improve(instance, iterations=0)
     bad = [[0, *range(1, 60), 0], [0, 0], [0, 0]]
-    monkeypatch.setattr(_sisr, "anneal", lambda search, iterations, hot, cold, best, *_: starts.append(best) or best)
+    monkeypatch.setattr(sisr, "anneal", lambda search, iterations, hot, cold, best, *_: starts.append(best) or best)
     assert improve(instance, good) == good
     assert improve(instance, bad) == greedy
-    expected = [makespan(instance.nodes, good), makespan(instance.nodes, greedy)]
+    expected = [makespan(instance, good), makespan(instance, greedy)]
     assert expected[0] < expected[1]
     assert starts == pytest.approx(np.repeat(expected, 4).tolist())  # at the beginning of each round
 
@@ -183,7 +185,7 @@ def test_the_search_starts_from_the_given_tours_or_greedy_insertion(monkeypatch)
 def test_coincident_cities(nodes: list, n_agents: int) -> None:
     """All cities in one place: the first agent there can visit all of them, which is optimal."""
     instance = Instance(nodes, n_agents)
-    assert makespan(instance.nodes, improve(instance, iterations=10)) == 2 * math.dist(*nodes[:2])
+    assert makespan(instance, improve(instance, iterations=10)) == 2 * math.dist(*nodes[:2])
 
 
 # When it ends
@@ -193,15 +195,15 @@ def test_coincident_cities(nodes: list, n_agents: int) -> None:
 def test_the_search_ends_at_the_lower_bound(limit: dict) -> None:
     """It would not end otherwise; with 20 agents the farthest city alone makes the makespan."""
     instance = random_instance(0, 60, 20)
-    assert makespan(instance.nodes, improve(instance, iterations=0)) > lower_bound(instance) + 1e-3
-    assert makespan(instance.nodes, improve(instance, **limit)) <= lower_bound(instance) + 1e-9
+    assert makespan(instance, improve(instance, iterations=0)) > lower_bound(instance) + 1e-3
+    assert makespan(instance, improve(instance, **limit)) <= lower_bound(instance) + 1e-9
 
 
 @pytest.mark.parametrize(("given", "total"), [(150, 150), (15, 15), (7, 7), (None, 500 * 40)])
 def test_iterations_cool_down_four_times(turns: list, given: int | None, total: int) -> None:
     """Each time twice as long; in units of greedy insertion's makespan times sqrt(m / n)."""
     instance = random_instance(5, 40, 3)
-    unit = makespan(instance.nodes, inserted_greedily(instance)) * math.sqrt(3 / 40)
+    unit = makespan(instance, inserted_greedily(instance)) * math.sqrt(3 / 40)
     improve(instance, iterations=given)
     iterations, hot, cold = np.array(turns).T
     assert np.cumsum(iterations).tolist() == [math.ceil(total * part / 15) for part in (1, 3, 7, 15)]
@@ -255,9 +257,11 @@ def test_tidy_tours_are_shorter_where_it_does_not_show() -> None:
         nodes, *(improve_batch(nodes, 12, 4000, tidy=tidy) for tidy in (False, True)), strict=True
     ):
         check_tours(Instance(row, 12), tidy)
-        assert makespan(row, loose) == pytest.approx(lower_bound(Instance(row, 12)))  # which ended that search
-        assert makespan(row, tidy) <= 1.005 * makespan(row, loose)
-        assert tour_lengths(row, tidy).sum() < 0.9 * tour_lengths(row, loose).sum()
+        assert makespan(Instance(row, 12), loose) == pytest.approx(
+            lower_bound(Instance(row, 12))
+        )  # which ended that search
+        assert makespan(Instance(row, 12), tidy) <= 1.005 * makespan(Instance(row, 12), loose)
+        assert path_lengths(row, tidy).sum() < 0.9 * path_lengths(row, loose).sum()
 
 
 def test_batches_of_other_kinds() -> None:
@@ -274,7 +278,7 @@ def test_batches_of_other_kinds() -> None:
 @pytest.mark.parametrize(("n", "k"), [(2, 0), (3, 1), (40, 20), (40, 38)])
 def test_nearest_cities(n: int, k: int) -> None:
     nodes = np.random.default_rng(n).random((n, 2))
-    near, distance = _sisr.nearest_cities(nodes[:, 0].copy(), nodes[:, 1].copy(), n, k)
+    near, distance = sisr.nearest_cities(nodes[:, 0].copy(), nodes[:, 1].copy(), n, k)
     assert near.shape == distance.shape == (n, k)
     for city in range(1, n):
         others = sorted((math.dist(nodes[city], nodes[other]), other) for other in range(1, n) if other != city)[:k]
@@ -289,50 +293,50 @@ def test_lengths_are_kept_as_the_judge_finds_them(n: int, m: int, hot: float, we
     """After many iterations, accepted (hot) or undone (cold), without summing afresh; a cold objective never grows."""
 
     def score(tours: Tours) -> float:
-        lengths = tour_lengths(instance.nodes, tours)
+        lengths = tour_lengths(instance, tours)
         return lengths.max() + weight * lengths.sum()
 
     instance = random_instance(10, n, m)
-    search = _search.new_search(instance.nodes, m, seed=1)
-    _sisr.insert_greedily(search, np.arange(1, n))
-    best, objective = _sisr.sum_lengths(search) + weight * search.length.sum(), math.inf
+    search = search_arrays.new_search(instance.nodes, m, seed=1)
+    sisr.insert_greedily(search, np.arange(1, n))
+    best, objective = sisr.sum_lengths(search) + weight * search.length.sum(), math.inf
     for _ in range(10):
-        best = _sisr.anneal(search, 300, hot, hot, best, -1.0, weight)
-        assert score(_search.as_tours(_sisr.best_order(search), m)) == pytest.approx(best)
+        best = sisr.anneal(search, 300, hot, hot, best, -1.0, weight)
+        assert score(search_arrays.as_tours(sisr.best_order(search), m)) == pytest.approx(best)
 
         now = search._replace(best=search.next)
-        tours = _search.as_tours(_sisr.best_order(now), m)
+        tours = search_arrays.as_tours(sisr.best_order(now), m)
         check_tours(instance, tours)
-        assert search.length == pytest.approx(tour_lengths(instance.nodes, tours), abs=1e-10)
+        assert search.length == pytest.approx(tour_lengths(instance, tours), abs=1e-10)
         assert search.count.tolist() == [len(tour) - 2 for tour in tours]
         assert (search.previous[search.next] == np.arange(n + m)).all()
         if hot < 1e-6:
-            before, objective = objective, search.length.max() + _sisr.TOTAL_WEIGHT * search.length.sum()
+            before, objective = objective, search.length.max() + sisr.TOTAL_WEIGHT * search.length.sum()
             assert objective <= before + 1e-6
 
 
 def test_tours_are_loaded_as_given() -> None:
     """But for idle agents, who come last, and for depots in between, which are left out; whatever was there before."""
-    search = _search.new_search(np.random.default_rng(0).random((6, 2)), 4, seed=0)
-    _sisr.insert_greedily(search, np.arange(1, 6))
+    search = search_arrays.new_search(np.random.default_rng(0).random((6, 2)), 4, seed=0)
+    sisr.insert_greedily(search, np.arange(1, 6))
     tours = [[0, 0], [0, 3, 0, 0, 1, 0], [0, 0], [0, 5, 2, 4, 0]]
-    _sisr.load_tours(search, _search.as_order(tours, 5 + 4))
-    assert _search.as_tours(_sisr.best_order(search), 5) == [[0, 3, 1, 0], [0, 5, 2, 4, 0], [0, 0], [0, 0], [0, 0]]
-    assert _sisr.sum_lengths(search) == pytest.approx(
-        makespan(np.stack([search.x, search.y], 1)[:6], [[0, 3, 1, 0], tours[3]])
+    sisr.load_tours(search, search_arrays.as_order(tours, 5 + 4))
+    assert search_arrays.as_tours(sisr.best_order(search), 5) == [[0, 3, 1, 0], [0, 5, 2, 4, 0], [0, 0], [0, 0], [0, 0]]
+    assert sisr.sum_lengths(search) == pytest.approx(
+        path_lengths(np.stack([search.x, search.y], 1)[:6], [[0, 3, 1, 0], tours[3]]).max()
     )
 
 
 def test_rounds_begin_with_the_best_tours(monkeypatch) -> None:
-    anneal = _sisr.anneal
+    anneal = sisr.anneal
     found = []
 
     def checked(search, iterations, hot, cold, best, *goal):
         found.append(best)
-        assert _sisr.sum_lengths(search) == pytest.approx(best)
+        assert sisr.sum_lengths(search) == pytest.approx(best)
         return anneal(search, iterations, hot, hot, best, *goal)  # which leaves it far from the best
 
-    monkeypatch.setattr(_sisr, "anneal", checked)
+    monkeypatch.setattr(sisr, "anneal", checked)
     improve(random_instance(11, 50, 4), iterations=1500)
     assert len(found) == 4 and found[0] > found[-1]
 
@@ -343,12 +347,12 @@ def test_rounds_begin_with_the_best_tours(monkeypatch) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"seconds": 0}, "seconds must be a finite number above 0, got 0"),
-        ({"seconds": -1.0}, "seconds must be a finite number above 0, got -1.0"),
-        ({"seconds": math.nan}, "seconds must be a finite number above 0, got nan"),
-        ({"seconds": math.inf}, "seconds must be a finite number above 0, got inf"),
-        ({"seconds": "soon"}, "seconds must be a finite number above 0, got 'soon'"),
-        ({"seconds": True}, "seconds must be a finite number above 0, got True"),
+        ({"seconds": 0}, "seconds must be a finite number of seconds above 0, got 0"),
+        ({"seconds": -1.0}, "seconds must be a finite number of seconds above 0, got -1.0"),
+        ({"seconds": math.nan}, "seconds must be a finite number of seconds above 0, got nan"),
+        ({"seconds": math.inf}, "seconds must be a finite number of seconds above 0, got inf"),
+        ({"seconds": "soon"}, "seconds must be a finite number of seconds above 0, got 'soon'"),
+        ({"seconds": True}, "seconds must be a finite number of seconds above 0, got True"),
         ({"iterations": -1}, "iterations must be a whole number of at least 0, got -1"),
         ({"iterations": 1.5}, "iterations must be a whole number of at least 0, got 1.5"),
         ({"seed": -1}, "seed must be a whole number of at least 0, got -1"),
@@ -369,7 +373,7 @@ def test_bad_arguments_are_named(square: Instance, arguments: dict, message: str
         (np.zeros((3, 4, 3)), {}, r"nodes must have shape \(n, 2\), got \(3, 4, 3\)"),
         (np.zeros((3, 1, 2)), {}, "n_nodes must be a whole number of at least 2, got 1"),
         (np.full((3, 4, 2), np.nan), {}, "nodes must be finite"),
-        (np.full((3, 4, 2), 1.5), {}, "unit square"),
+        (np.full((3, 4, 2), 1.5), {}, r"nodes must be in \[0, 1\]"),
         (np.zeros((3, 4, 2)), {"n_agents": 0}, "n_agents must be a whole number of at least 1, got 0"),
         (np.zeros((3, 4, 2)), {"threads": 0}, "threads must be a whole number of at least 1, got 0"),
         (np.zeros((3, 4, 2)), {"iterations": -1}, "iterations must be a whole number of at least 0, got -1"),

@@ -221,3 +221,9 @@ def test_a_plain_function_is_built_as_a_module(own):
 def test_networks_that_cannot_be_built_are_named(own, name, config, message):
     with pytest.raises(ValueError, match=message):
         build(name, config)
+
+
+def test_loading_draws_no_random_numbers(file):
+    before = torch.get_rng_state()
+    load(file)
+    assert torch.equal(torch.get_rng_state(), before)

@@ -73,7 +73,7 @@ def test_without_asking_there_is_no_regret(searches: list) -> None:
     env.reset(seed=0)
     play(env)
     assert searches == []
-    assert [set(info) for info in env.infos.values()] == [{"makespan", "tours"}] * 2
+    assert [set(info) for info in env.infos.values()] == [{"makespan"}] * 2
 
 
 def test_nobody_regrets_a_tour_of_no_length(searches: list) -> None:

@@ -5,10 +5,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tensordict import TensorDict
 
 from benchmarks.policies.nearest import nearest
-from dan_policy import make_actor, solve
-from dan_policy.solution import SPEED, _set_out
+from dan_policy import solve
+from dan_policy.games import begin
+from dan_policy.planning import SPEED
 from mtsp_env import Instance, check_tours, rules, uniform
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.instance import Tours
@@ -18,34 +20,50 @@ def moments(instance: Instance, seed: int, depot: str = "final") -> list[tuple[r
     """Every state of a random game but the last, and the tours so far."""
     env = BatchedMTSP(instance.n_nodes, instance.n_agents, [1], SPEED, depot=depot)
     torch.manual_seed(seed)
-    td = env.reset(env.reset().set("nodes", torch.tensor(instance.nodes)[None]).select("nodes"), set_state=True)
-    found = []
+    nodes = torch.tensor(instance.nodes)[None]
+    td = env.reset(TensorDict({"game": TensorDict({"nodes": nodes}, [1])}, [1]), set_state=True)
+    moments = []
     while not td["done"].item():
-        state = rules.State(*(td[name].numpy() for name in rules.State._fields))
-        found.append((state, rules.tours(state.visits[0], state.destination[0], close=False)))
+        arrays = {name: tensor.numpy() for name, tensor in td["game"].items()}
+        tours = rules.tours(arrays["visits"][0], arrays["destination"][0], close=False)
+        moments.append((rules.state_from_arrays(arrays, instance.n_agents), tours))
         td = env.step(env.rand_action(td))["next"]
-    return found
+    return moments
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(2, 12), st.integers(1, 5))
 @settings(max_examples=60, deadline=None)
-def test_prefixes_lead_to_the_very_moment_that_they_were_taken_at(seed: int, n_nodes: int, n_agents: int) -> None:
+def test_prefixes_lead_to_the_moment_at_which_they_were_taken(seed: int, n_nodes: int, n_agents: int) -> None:
     instance = uniform(np.random.default_rng(seed), n_nodes, n_agents)
     game = rules.make_rules(n_nodes, n_agents, SPEED, "final", "sparse", None)
     for state, prefixes in moments(instance, seed):
-        again = _set_out(instance, game, prefixes)
-        for name in rules.State._fields:
-            np.testing.assert_allclose(getattr(again, name), getattr(state, name), rtol=0, atol=1e-12, err_msg=name)
+        again = begin(instance, game, prefixes).arrays()
+        for name, array in state.arrays().items():
+            np.testing.assert_allclose(again[name], array, rtol=0, atol=1e-12, err_msg=name)
 
 
-@pytest.mark.parametrize("policy", ["default", make_actor(nearest)], ids=["DAN", "nearest"])
+def test_games_side_by_side_begin_at_the_same_moment() -> None:
+    """In the square's symmetries, too, in which every length stays what it is."""
+    instance = uniform(np.random.default_rng(1), 9, 3)
+    game = rules.make_rules(9, 3, SPEED, "final", "sparse", None)
+    prefixes = [[0, 4, 2], [0], [0, 1]]
+    alone = begin(instance, game, prefixes).arrays()
+    for augment in (False, True):
+        many = begin(instance, game, prefixes, 11, augment).arrays()
+        for name in ("visits", "destination", "ready", "departed", "leg", "length", "home"):
+            np.testing.assert_allclose(many[name], np.repeat(alone[name], 11, axis=0), rtol=0, atol=1e-12)
+        distinct = {nodes.round(6).tobytes() for nodes in many["nodes"]}
+        assert len(distinct) == (8 if augment else 1)
+
+
+@pytest.mark.parametrize("policy", ["default", nearest], ids=["DAN", "nearest"])
 def test_a_plan_goes_on_as_it_would_have(policy) -> None:
-    """Greedy play does not look back, so what is left of a plan is planned again, from any moment."""
+    """Greedy play does not look back, so the rest of a plan is planned again in the same way, from any moment."""
     instance = uniform(np.random.default_rng(5), 20, 3)
     plan = solve(instance, policy)
     played = np.concatenate([np.array(tour[1:-1]) for tour in plan.tours])
     assert sorted(played) == list(range(1, 20))
-    state = _set_out(instance, rules.make_rules(20, 3, SPEED, "final", "sparse", None), [t[:-1] for t in plan.tours])
+    state = begin(instance, rules.make_rules(20, 3, SPEED, "final", "sparse", None), [t[:-1] for t in plan.tours])
     order = np.argsort(state.visits[0, 1:]) + 1  # the cities in the order of decisions
     for done in range(20):
         visited = set(order[:done].tolist())

@@ -19,7 +19,7 @@ HALVES = [[0, 1, 2, 3, 0], [0, 4, 5, 6, 7, 0]]
 ALL_BY_ONE = one_agent_does_it_all(INSTANCES[0])
 SWAPPED = [[0, 2, 1, 3, 0], [0, 4, 5, 6, 7, 0]]
 COSTS = {
-    name: [makespan(i.nodes, tours) for i in INSTANCES]
+    name: [makespan(i, tours) for i in INSTANCES]
     for name, tours in (("halves", HALVES), ("one", ALL_BY_ONE), ("swapped", SWAPPED))
 }
 

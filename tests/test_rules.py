@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from oracle import Oracle
 
 from mtsp_env import Instance, check_tours, makespan, rules
+from mtsp_env.instance import FIELDS, Problem
 
 
 @pytest.mark.parametrize("seeds", [range(start, start + 10) for start in range(0, 80, 10)], ids=str)
@@ -54,7 +55,7 @@ def test_odd_games_are_algorithm_1s(game: Game) -> None:
 def walk(seed: int, array: Callable = np.array) -> tuple[Game, list[rules.State]]:
     """Random games and all their states under the oracle's actions, from the start to two steps beyond the last end."""
     game, traces = play_random(seed)
-    state = rules.start(array(game.nodes), game.n_agents)
+    state = rules.start(Problem(game.n_agents, {"nodes": array(game.nodes)}))
     states, actions = [state], [trace.actions for trace in traces]
     for k in range(max(map(len, actions)) + 2):
         state = rules.depart(state, game.rules, array([row[k] if k < len(row) else 0 for row in actions]))
@@ -88,7 +89,7 @@ def test_rewards_are_the_judges_makespan(seed: int) -> None:
         if not trace.end.truncated:
             instance = Instance(game.nodes[row], game.n_agents)
             check_tours(instance, trace.end.tours)
-            assert sum(trace.rewards) == pytest.approx(-makespan(instance.nodes, trace.end.tours), abs=1e-9)
+            assert sum(trace.rewards) == pytest.approx(-makespan(instance, trace.end.tours), abs=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -111,15 +112,23 @@ def test_shaped_rewards_sum_to_the_sparse_one(seed: int) -> None:
 def test_states_keep_their_shape_and_masks_are_never_empty(seed: int, array: Callable) -> None:
     game, states = walk(seed, array)
     for state in states:
-        assert [(x.shape, x.dtype) for x in state] == [(x.shape, x.dtype) for x in states[0]]
+        described = {"nodes": FIELDS["nodes"], **rules.STATE_FIELDS}
+        assert state.arrays().keys() == described.keys()
+        for name, x in state.arrays().items():
+            sizes = described[name].sizes(game.nodes.shape[1], game.n_agents)
+            assert (tuple(x.shape), _kind(x)) == ((len(game.nodes), *sizes), described[name].dtype), name
         for agent in range(game.n_agents):
             seen = rules.observe(state, game.rules, array([agent] * len(game.nodes)))
             assert seen.action_mask.any(1).all()
             assert not (seen.action_mask[:, 1:] & seen.visited[:, 1:]).any()
             assert not seen.visited[:, 0].any()
             assert not seen.agents[:, agent, :2].any()  # it sees the world from its destination
-            kinds = [str(x.dtype).removeprefix("torch.") for x in seen]
-            assert kinds == ["float32", "float32", "bool", "bool"]
+            assert [_kind(x) for x in seen] == ["float32", "float32", "bool", "bool", "int64"]
+
+
+def _kind(array: rules.Array) -> str:
+    """The name of its dtype, the same for NumPy and torch."""
+    return str(array.dtype).removeprefix("torch.")
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -131,7 +140,9 @@ def test_finished_games_stand_still(seed: int) -> None:
         over = rules.all_visited(before)
         assert (rules.all_visited(after) | ~over).all()
         assert rules.makespan(after)[over] == pytest.approx(rules.makespan(before)[over], abs=1e-12)
-        assert rules.legal_actions(before, how, before.agent)[over].sum() == over.sum()  # the depot alone
+        assert (
+            rules.legal_actions(before, how, rules.agent_to_decide(before))[over].sum() == over.sum()
+        )  # the depot alone
         for row in np.flatnonzero(over):
             assert rules.tours(after.visits[row], after.destination[row]) == rules.tours(
                 before.visits[row], before.destination[row]
@@ -139,10 +150,10 @@ def test_finished_games_stand_still(seed: int) -> None:
 
 
 def test_depart_changes_nothing_in_place() -> None:
-    state = rules.start(np.random.default_rng(0).random((2, 6, 2)), 3)
-    copies = [x.copy() for x in state]
+    state = rules.start(Problem(3, {"nodes": np.random.default_rng(0).random((2, 6, 2))}))
+    copies = {name: array.copy() for name, array in state.arrays().items()}
     rules.depart(state, rules.make_rules(6, 3, 0.1, "open", "sparse", None), np.array([2, 3]))
-    assert all(np.array_equal(x, copy) for x, copy in zip(state, copies, strict=True))
+    assert all(np.array_equal(array, copies[name]) for name, array in state.arrays().items())
 
 
 @pytest.mark.parametrize("size", [(2, 1), (2, 5), (9, 3), (30, 1), (25, 12)], ids=str)
@@ -198,9 +209,9 @@ def test_the_depot_rules_by_hand(
     """Two agents, four cities at ten ticks from the depot."""
     nodes = np.array([[0.5, 0.5], [0.5, 0.6], [0.5, 0.4], [0.6, 0.5], [0.4, 0.5]])
     how = rules.make_rules(5, 2, 0.01, depot, "sparse", None)
-    oracle, state = Oracle(nodes, 2, 0.01, depot), rules.start(nodes[None], 2)
+    oracle, state = Oracle(nodes, 2, 0.01, depot), rules.start(Problem(2, {"nodes": nodes[None]}))
     for action, legal, tick in zip(actions, depot_is_legal, ticks, strict=True):
-        assert rules.legal_actions(state, how, state.agent)[0, 0] == oracle.legal_actions()[0] == legal
+        assert rules.legal_actions(state, how, rules.agent_to_decide(state))[0, 0] == oracle.legal_actions()[0] == legal
         assert state.ready.min() == oracle.tick == tick
         oracle.step(action)
         state = rules.depart(state, how, np.array([action]))

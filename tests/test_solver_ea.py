@@ -75,7 +75,7 @@ def test_chromosomes_are_tours_as_the_judge_sees_them(size):
     for chromosome, least, score in zip(population, longest, fitness, strict=True):
         tours = ea.decode(chromosome, instance)
         check_tours(instance, tours)
-        assert least == pytest.approx(makespan(instance.nodes, tours))
+        assert least == pytest.approx(makespan(instance, tours))
         assert least <= score <= (1 + ea.MEAN_WEIGHT) * least
         again = ea.encode(tours, instance)
         assert every_symbol_once(again[None])
@@ -132,14 +132,14 @@ def test_odd_instances_are_solved(name):
 def test_the_optimum_of_small_instances_is_reached():
     for instance in [*Cell(7, 3, 2).instances(3), *Cell(8, 2, 3).instances(3)]:
         tours = ea.solve(instance, 60.0, 0, generations=300)
-        assert makespan(instance.nodes, tours) == pytest.approx(_optima.by_subsets(instance))
+        assert makespan(instance, tours) == pytest.approx(_optima.by_subsets(instance))
 
 
 @pytest.mark.parametrize("weight", [ea.MEAN_WEIGHT, 5.0])  # with 5, the fittest often have long tours
 def test_the_best_tours_are_never_lost(weight, monkeypatch):
     monkeypatch.setattr(ea, "MEAN_WEIGHT", weight)
     (instance,) = Cell(30, 3, 1).instances(1)
-    costs = [makespan(instance.nodes, ea.solve(instance, 60.0, 0, generations=g)) for g in range(0, 150, 10)]
+    costs = [makespan(instance, ea.solve(instance, 60.0, 0, generations=g)) for g in range(0, 150, 10)]
     assert costs == sorted(costs, reverse=True)
     assert costs[-1] < 0.7 * costs[0]
 
@@ -149,7 +149,7 @@ def test_it_stops_at_the_lower_bound():
     began = time.process_time()
     tours = ea.solve(instance, 20.0, 0)
     assert time.process_time() - began < 1.0
-    assert makespan(instance.nodes, tours) == pytest.approx(lower_bound(instance))
+    assert makespan(instance, tours) == pytest.approx(lower_bound(instance))
 
 
 def test_bad_generations_are_refused():

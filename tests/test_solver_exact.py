@@ -59,7 +59,7 @@ def test_proofs_agree_with_trying_everything(instance):
     optimum, proof = try_everything(instance), exact.prove(instance, 60.0)
     check_tours(instance, proof.tours)
     assert proof.optimal and proof.gap <= exact.PROVED
-    assert proof.makespan == makespan(instance.nodes, proof.tours) == pytest.approx(optimum, rel=1e-6)
+    assert proof.makespan == makespan(instance, proof.tours) == pytest.approx(optimum, rel=1e-6)
     assert lower_bound(instance) - 1e-12 <= proof.bound <= optimum + 1e-12
     assert _optima.by_subsets(instance) == pytest.approx(optimum, rel=1e-12)
 
@@ -78,7 +78,7 @@ def test_odd_instances_are_proved_too(name):
 def test_the_square_is_solved_to_its_optimum_and_again_the_same(square):
     answer = exact.solve(square, 60.0, 0)
     assert isinstance(answer, Answer)
-    assert makespan(square.nodes, answer.tours) == pytest.approx(2.0)
+    assert makespan(square, answer.tours) == pytest.approx(2.0)
     assert 2.0 * (1 - exact.PROVED) <= answer.bound <= 2.0
     assert exact.solve(square, 60.0, 0) == answer
 
@@ -110,7 +110,7 @@ def test_given_tours_are_the_first_answer():
     program = Program(instance, start)
     found = _milp.minimise(program.variables, program.rows, 1.0, 0, "highs", program.start)
     assert found.values is not None  # without them, HiGHS finds none in a minute
-    assert makespan(instance.nodes, exact.solve(instance, 0.5, 0, start=start).tours) <= makespan(instance.nodes, start)
+    assert makespan(instance, exact.solve(instance, 0.5, 0, start=start).tours) <= makespan(instance, start)
     small = SMALL[0]
     assert exact.prove(small, 60.0, start=thirds(small)).makespan == pytest.approx(try_everything(small), rel=1e-6)
     with pytest.raises(ValueError, match="missing from the tours"):

@@ -76,7 +76,7 @@ def test_the_first_solution_is_one_agent_that_goes_to_the_nearest_city_next():
 def test_a_descent_is_much_better_and_always_the_same():
     for instance in Cell(20, 3, 2).instances(2):
         first, descent = (ortools.solve(instance, 20.0, 0, search) for search in ("first", "greedy_descent"))
-        assert makespan(instance.nodes, descent) < 0.6 * makespan(instance.nodes, first)
+        assert makespan(instance, descent) < 0.6 * makespan(instance, first)
         assert descent == ortools.solve(instance, 20.0, 1, "greedy_descent")
 
 
@@ -86,32 +86,32 @@ def test_guided_search_reaches_the_optimum_of_small_instances():
         tours = ortools.solve(instance, 0.3, 0, "guided")
         # SPAN_COST * longest + sum is least, and the optimum's sum is at most m times its longest
         slack = instance.n_agents * optimum / ortools.SPAN_COST + 10 / ortools.UNIT
-        assert optimum - 1e-9 <= makespan(instance.nodes, tours) <= optimum + slack
+        assert optimum - 1e-9 <= makespan(instance, tours) <= optimum + slack
 
 
 def test_no_tour_is_longer_than_the_limit():
     (instance,) = Cell(30, 3, 1).instances(4)
     distance = whole_lengths(instance)
-    limit = int(0.6 * ortools.UNIT * makespan(instance.nodes, [nearest_next(instance)]))
+    limit = int(0.6 * ortools.UNIT * makespan(instance, [nearest_next(instance)]))
     problem = ortools.Problem(distance, 3, limit, "GREEDY_DESCENT")
     tours = problem.tours(problem.search(time.perf_counter() + 5.0, only_first=True))
     check_tours(instance, tours)
-    assert ortools.UNIT * makespan(instance.nodes, tours) <= limit + 30
+    assert ortools.UNIT * makespan(instance, tours) <= limit + 30
 
 
 def test_agents_share_the_cities_before_guided_search():
     for instance in Cell(60, 4, 2).instances(5):
         distance, seconds = whole_lengths(instance), 5.0
         problem, found = ortools._share_cities(distance, 4, seconds, time.perf_counter() + seconds)
-        share = makespan(instance.nodes, [nearest_next(instance)]) / 4
+        share = makespan(instance, [nearest_next(instance)]) / 4
         tours = problem.tours(found)
         check_tours(instance, tours)
-        assert makespan(instance.nodes, tours) < share + 2 * distance[0].max() / ortools.UNIT
+        assert makespan(instance, tours) < share + 2 * distance[0].max() / ortools.UNIT
 
 
 def test_the_nearest_city_next_is_as_long_as_its_tour():
     (instance,) = Cell(30, 3, 1).instances(6)
-    length = makespan(instance.nodes, [nearest_next(instance)])
+    length = makespan(instance, [nearest_next(instance)])
     assert ortools._nearest_next(whole_lengths(instance)) == pytest.approx(ortools.UNIT * length, abs=30)
 
 

@@ -97,15 +97,15 @@ def test_one_map_parts_the_cities_of_two_agents():
 
 def test_maps_beat_random_tours_and_more_of_them_are_never_worse():
     (instance,) = Cell(50, 5, 1).instances(2)
-    costs = [makespan(instance.nodes, som.solve(instance, 60.0, 0, guided=False, maps=k)) for k in (1, 2, 5, 20)]
+    costs = [makespan(instance, som.solve(instance, 60.0, 0, guided=False, maps=k)) for k in (1, 2, 5, 20)]
     assert costs == sorted(costs, reverse=True)
     assert costs[0] < 2 * lower_bound(instance)
 
 
 def test_evolution_begins_with_the_tours_of_the_maps():
     (instance,) = Cell(50, 5, 1).instances(2)
-    alone = makespan(instance.nodes, som.solve(instance, 60.0, 0, guided=False, maps=3))
-    begun, bred = (makespan(instance.nodes, som.solve(instance, 60.0, 0, True, 3, g)) for g in (0, 100))
+    alone = makespan(instance, som.solve(instance, 60.0, 0, guided=False, maps=3))
+    begun, bred = (makespan(instance, som.solve(instance, 60.0, 0, True, 3, g)) for g in (0, 100))
     assert bred < begun <= alone < 1.05 * begun
 
 

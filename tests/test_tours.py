@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mtsp_env import Instance, check_tours, lower_bound, makespan, tour_lengths
-from mtsp_env.tours import farthest_trip
+from mtsp_env import Instance, check_tours, from_coordinates, lower_bound, makespan, tour_lengths
+from mtsp_env.tours import farthest_trip, path_lengths
 
 
 def shortest_tours(nodes: np.ndarray) -> dict[frozenset[int], float]:
@@ -44,15 +44,18 @@ small = st.builds(Instance, st.lists(points, min_size=2, max_size=6), st.integer
 
 def test_square_by_hand(square: Instance, square_tours: list[list[int]]) -> None:
     check_tours(square, square_tours)
-    assert tour_lengths(square.nodes, square_tours).tolist() == [2.0, 2.0]
-    assert makespan(square.nodes, square_tours) == optimum(square) == 2.0
+    assert tour_lengths(square, square_tours).tolist() == [2.0, 2.0]
+    assert makespan(square, square_tours) == optimum(square) == 2.0
 
 
 def test_lengths_by_hand() -> None:
     nodes = [[0.0, 0.0], [3.0, 4.0], [3.0, 0.0]]
-    assert tour_lengths(nodes, [[0, 1, 2, 0], [0, 1, 0], [0, 0], [0], [0, 2, 1]]).tolist() == [12, 10, 0, 0, 7]
-    assert makespan(nodes, [[0, 1, 0], [0, 2, 0]]) == 10.0
-    assert makespan(nodes, []) == 0.0
+    paths = [[0, 1, 2, 0], [0, 1, 0], [0, 0], [0], [0, 2, 1]]
+    assert path_lengths(np.array(nodes), paths).tolist() == [12, 10, 0, 0, 7]
+    instance = from_coordinates(nodes, 2)  # four of its units to one
+    assert (tour_lengths(instance, paths) * instance.scale).tolist() == [12, 10, 0, 0, 7]
+    assert makespan(instance, [[0, 1, 0], [0, 2, 0]]) * instance.scale == 10.0
+    assert makespan(instance, []) == 0.0
 
 
 @settings(deadline=None)
@@ -60,7 +63,7 @@ def test_lengths_by_hand() -> None:
 def test_a_tour_is_as_long_backwards(instance: Instance, random) -> None:
     order = list(range(1, instance.n_nodes))
     random.shuffle(order)
-    there, back = tour_lengths(instance.nodes, [[0, *order, 0], [0, *order[::-1], 0]])
+    there, back = tour_lengths(instance, [[0, *order, 0], [0, *order[::-1], 0]])
     assert there == pytest.approx(back, abs=1e-12)
 
 
@@ -84,7 +87,7 @@ def test_valid_tours_pass_and_no_bound_is_above_them(case: tuple) -> None:
     instance, tours = case
     check_tours(instance, tours)
     check_tours(instance, [np.array(tour) for tour in tours])
-    assert lower_bound(instance) <= makespan(instance.nodes, tours) + 1e-12
+    assert lower_bound(instance) <= makespan(instance, tours) + 1e-12
 
 
 @settings(deadline=None)
@@ -171,7 +174,7 @@ def test_with_an_agent_for_each_city_the_farthest_trip_is_the_optimum(instance: 
     tours = [[0, city, 0] for city in range(1, many.n_nodes)]
     tours += [[0, 0]] * (many.n_agents - len(tours))
     check_tours(many, tours)
-    assert makespan(many.nodes, tours) == pytest.approx(farthest_trip(instance.nodes), abs=1e-12)
+    assert makespan(many, tours) == pytest.approx(farthest_trip(instance.nodes), abs=1e-12)
     assert farthest_trip(instance.nodes) <= lower_bound(instance)
 
 

@@ -52,9 +52,9 @@ class Buffer:
             (decisions, valid), step = self.sets[i], self.left[i].pop()
             batches.append(decisions[step][valid[step]])
         remaining = [i for i, left in enumerate(self.left) if left]
-        self.indices, self.left, self.sets = (
-            [values[i] for i in remaining] for values in (self.indices, self.left, self.sets)
-        )
+        self.indices = [self.indices[i] for i in remaining]
+        self.left = [self.left[i] for i in remaining]
+        self.sets = [self.sets[i] for i in remaining]
         return batches
 
     def add(self, index: int) -> None:

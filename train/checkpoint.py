@@ -77,7 +77,8 @@ def check_same_run(old: dict[str, Any], config: RunConfig) -> None:
     for option in fields(config):
         value = getattr(config, option.name)
         if is_dataclass(value):
-            old[option.name] = asdict(type(value)()) | old[option.name]
+            options_type: Any = type(value)
+            old[option.name] = asdict(options_type()) | old[option.name]
     changed = [name for name in new if name not in FREE_ON_RESUME and old[name] != new[name]]
     if changed:
         differences = ", ".join(f"{name} was {old[name]!r}, is {new[name]!r}" for name in changed)

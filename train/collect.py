@@ -14,6 +14,7 @@ from dan_policy.symmetry import views
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.distributions import sample
 from mtsp_env.instance import Problem
+from mtsp_env.rules import Depot
 from train.config import RunConfig
 
 
@@ -85,7 +86,7 @@ def environment(problem: Problem, config: RunConfig) -> BatchedMTSP:
 
 
 @lru_cache(maxsize=1024)
-def _environment(n_nodes: int, n_agents: int, batch: int, speed: float, depot: str, device: str) -> BatchedMTSP:
+def _environment(n_nodes: int, n_agents: int, batch: int, speed: float, depot: Depot, device: str) -> BatchedMTSP:
     return BatchedMTSP(n_nodes, n_agents, batch, speed, depot, device=device, check_actions=False)
 
 

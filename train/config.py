@@ -131,8 +131,8 @@ class RunConfig:
         """The registered network's configuration, or the factory's keyword arguments."""
         if not self.registered:
             return dict(self.policy_options)
-        config_type = NETWORKS[self.policy].config
-        return next(asdict(value) for value in vars(self).values() if type(value) is config_type)
+        options = {type(value): value for value in vars(self).values()}
+        return asdict(options[NETWORKS[self.policy].config])
 
     def generator(self) -> str | Generator:
         """The name of a distribution, or the function that ``package.module:function`` names.
@@ -209,9 +209,9 @@ class ReinforceConfig(RunConfig):
         self._check_positive("learning_rate", "decay")
         if self.batch_tokens is not None:
             self._check_at_least(1, "batch_tokens")
-        for first, *ranges in self.curriculum:
-            check_count("curriculum: first step", first, 0)
-            replace(self, curriculum=(), n_nodes=tuple(ranges[:2]), n_agents=tuple(ranges[2:]))
+        for stage in self.curriculum:
+            check_count("curriculum: first step", stage[0], 0)
+            self._at_stage(stage)  # which checks the ranges
         if not 0 < self.decisions <= 1:
             raise ValueError(f"decisions must be above 0 and at most 1, got {self.decisions!r}")
         if not 0 < self.challenge_p < 1:
@@ -219,10 +219,12 @@ class ReinforceConfig(RunConfig):
 
     def at(self, step: int) -> ReinforceConfig:
         """The configuration with the ranges of the curriculum's stage at ``step``."""
-        begun = [ranges for first, *ranges in self.curriculum if first <= step]
-        if not begun:
-            return self
-        return replace(self, curriculum=(), n_nodes=tuple(begun[-1][:2]), n_agents=tuple(begun[-1][2:]))
+        begun = [stage for stage in self.curriculum if stage[0] <= step]
+        return self._at_stage(begun[-1]) if begun else self
+
+    def _at_stage(self, stage: tuple[int, int, int, int, int]) -> ReinforceConfig:
+        _, least_n, greatest_n, least_m, greatest_m = stage
+        return replace(self, curriculum=(), n_nodes=(least_n, greatest_n), n_agents=(least_m, greatest_m))
 
 
 @dataclass(frozen=True, kw_only=True)

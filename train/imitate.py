@@ -43,15 +43,15 @@ class ImitationLearner(Learner):
         batches = self.buffer.draw(config.sets_per_step)
         waited = time.perf_counter() - start
         self.optimiser.zero_grad()
-        loss, next_loss, assignment_loss, agreed = 0.0, 0.0, 0.0, 0
+        loss = next_loss = assignment_loss = agreed = torch.zeros((), device=config.device)  # a GPU is not waited for
         for decisions in batches:  # each counts the same: one of 16 games at n = 200 as much as one of 256 at n = 20
             with autocast(config):
                 part = imitation_losses(self.network, decisions)
             total = part.loss + config.next_weight * part.next + config.assignment_weight * part.assignment
             (total / len(batches)).backward()
-            loss += part.loss.detach() / len(batches)
-            next_loss += part.next.detach() / len(batches)
-            assignment_loss += part.assignment.detach() / len(batches)
+            loss = loss + part.loss.detach() / len(batches)
+            next_loss = next_loss + part.next.detach() / len(batches)
+            assignment_loss = assignment_loss + part.assignment.detach() / len(batches)
             agreed = agreed + part.agreed
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.max_grad_norm)
         self.optimiser.step()
@@ -67,7 +67,7 @@ class ImitationLearner(Learner):
             "assignment_loss": float(assignment_loss),
             "agreement": float(agreed) / count,
             "grad_norm": float(norm),
-            "learning_rate": self.schedule.get_last_lr()[0],
+            "learning_rate": float(self.schedule.get_last_lr()[0]),
             "decisions_per_second": count / (time.perf_counter() - start),
             "seconds_waited": waited,
         }

@@ -66,6 +66,8 @@ def decisions_with_advantage(episode: Episode, advantage: Tensor) -> TensorDictB
     Padding after an episode's end is left out. Decisions are sorted by their index in the episode: neighbours have
     about equally many unvisited cities, which keeps ``prune_visited`` efficient.
     """
+    if episode.decisions is None:
+        raise ValueError("the episodes must keep their decisions: play(..., keep=True)")
     decisions = episode.decisions.set("advantage", advantage.expand_as(episode.valid))
     return decisions[episode.valid]
 

@@ -60,7 +60,7 @@ def observation_keys(network: nn.Module) -> tuple[Key, ...]:
 
 def _pruned(network: nn.Module, config: RunConfig) -> nn.Module:
     """The same weights in a network with another ``prune_visited``."""
-    options = asdict(network.config) if is_dataclass(network.config) else {}
+    options: dict[str, Any] = asdict(network.config) if is_dataclass(network.config) else {}
     if "prune_visited" not in options:
         raise ValueError(f"prune_visited must be None: the policy {config.policy!r} has no such option")
     changed = build(config.policy, options | {"prune_visited": config.prune_visited})

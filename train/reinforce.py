@@ -58,11 +58,11 @@ class ReinforceLearner(Learner):
 
         self.step += 1
         self.instances += len(problem.nodes) // config.samples * world_size()
-        logs = {
+        logs: dict[str, float] = {
             "cost": -float(episode.reward.mean()),
             "baseline": -float(value.mean()),
             "grad_norm": float(norm),
-            "learning_rate": self.schedule.get_last_lr()[0],
+            "learning_rate": float(self.schedule.get_last_lr()[0]),
             "episodes_per_second": len(advantage) * world_size() / (time.perf_counter() - start),
         }
         if self.step % config.challenge_every == 0:

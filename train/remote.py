@@ -124,6 +124,7 @@ class _EpisodeCollector(Collector):
         """The ``problem``, ``n_agents`` (B,) and ``action`` (B, T), padded to the environment's bound on T."""
         problem, episode = play_part(self.policy, self.config, self.step, self.worker_idx)
         self.step += 1
+        assert episode.decisions is not None  # play_part keeps them
         taken, batch = episode.decisions["action"], len(problem.nodes)  # (T, B)
         action = taken.new_zeros(batch, environment(problem, self.config).rules.max_decisions)
         action[:, : len(taken)] = taken.T

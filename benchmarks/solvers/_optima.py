@@ -13,7 +13,8 @@ from rich.progress import track
 from benchmarks.files import replace_text
 from benchmarks.solvers import SOLVERS, exact, lkh3, reference
 from benchmarks.suite import SEED, Cell
-from mtsp_env.instance import Instance, check_count
+from mtsp_env.checks import check_count
+from mtsp_env.instance import Instance
 from mtsp_env.tours import check_tours, makespan
 
 REPORT = Path(__file__).parents[1] / "results" / "exact.md"
@@ -112,9 +113,7 @@ def _check(instance: Instance, backend: str, seed: int) -> Checked:
     searched = reference.solve(instance, REFERENCE_SECONDS, seed), lkh3.solve(instance, LKH_SECONDS, seed)
     for tours in (proof.tours, *searched):
         check_tours(instance, tours)
-    return Checked(
-        instance.name, proof, seconds, by_subsets(instance), *(makespan(instance.nodes, t) for t in searched)
-    )
+    return Checked(instance.name, proof, seconds, by_subsets(instance), *(makespan(instance, t) for t in searched))
 
 
 def markdown(rows: list[Checked]) -> str:

@@ -25,7 +25,7 @@ class Program:
         self.n_agents, self.n_nodes = instance.n_agents, instance.n_nodes
         self.distance = np.linalg.norm(instance.nodes[:, None] - instance.nodes[None], axis=2)  # (n, n)
         self.home = self.distance[0]
-        limit = greedy_makespan(self.distance, self.n_agents) if start is None else makespan(instance.nodes, start)
+        limit = greedy_makespan(self.distance, self.n_agents) if start is None else makespan(instance, start)
         self.limit = limit + ROUNDING
         allowed = self.home[:, None] + self.distance + self.home <= self.limit
         np.fill_diagonal(allowed, False)

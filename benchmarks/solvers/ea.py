@@ -26,7 +26,8 @@ import time
 
 import numpy as np
 
-from mtsp_env.instance import Instance, Tours, check_count
+from mtsp_env.checks import check_count
+from mtsp_env.instance import Instance, Tours
 from mtsp_env.tours import lower_bound
 
 POPULATION = 40

@@ -88,7 +88,7 @@ def prove(
     if start is not None:
         check_tours(instance, start)
     program = Program(instance, start)
-    proof = Proof(start, np.inf if start is None else makespan(instance.nodes, start), lower_bound(instance))
+    proof = Proof(start, np.inf if start is None else makespan(instance, start), lower_bound(instance))
     while (left := end - time.perf_counter()) > 0:
         found = minimise(program.variables, program.rows, left, seed, backend, program.start)
         bound = max(proof.bound, found.bound * (1.0 - TOLERANCE))
@@ -97,7 +97,7 @@ def prove(
             break
         tours, cycles = program.tours(found.values)
         if not cycles:
-            length = makespan(instance.nodes, tours)
+            length = makespan(instance, tours)
             if length < proof.makespan:
                 proof = Proof(tours, length, min(proof.bound, length))
             break

@@ -67,7 +67,7 @@ def solve(instance: Instance, seconds: float, seed: int, trials: int = MANY) -> 
     found = [_read(text, instance) for text in texts if text.endswith("EOF\n")]  # a kill may leave half a file
     if not found:
         raise NoTours(f"LKH's first trial was not done in {seconds:g} s")
-    return min(found, key=lambda tours: makespan(instance.nodes, tours))
+    return min(found, key=lambda tours: makespan(instance, tours))
 
 
 def _program() -> str:

@@ -32,7 +32,8 @@ import numpy as np
 from numba import njit
 
 from benchmarks.solvers import ea
-from mtsp_env.instance import Instance, Tours, check_count
+from mtsp_env.checks import check_count
+from mtsp_env.instance import Instance, Tours
 from mtsp_env.tours import lower_bound, makespan
 
 NEURONS = 2.5  # for each city of an agent's fair share
@@ -73,9 +74,7 @@ def solve(
     _compile()
     started, rng = time.perf_counter(), np.random.default_rng(seed)
     if not guided:
-        return min(
-            train_maps(instance, started + seconds, maps, rng), key=lambda tours: makespan(instance.nodes, tours)
-        )
+        return min(train_maps(instance, started + seconds, maps, rng), key=lambda tours: makespan(instance, tours))
 
     found = list(train_maps(instance, started + MAP_SHARE * seconds, min(maps or math.inf, ea.POPULATION), rng))
     chromosomes = np.array([ea.encode(tours, instance) for tours in found])
@@ -98,7 +97,7 @@ def train_maps(instance: Instance, end: float, count: float | None, rng: np.rand
         if tours is None:
             return
         yield tours
-        if makespan(instance.nodes, tours) <= optimal:
+        if makespan(instance, tours) <= optimal:
             return
 
 

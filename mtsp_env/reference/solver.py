@@ -1,9 +1,4 @@
-"""Near-optimal tours in milliseconds to seconds, to measure regret against and to learn from (extra ``reference``).
-
->>> tours = improve(uniform(np.random.default_rng(0), n_nodes=50, n_agents=5), seconds=0.005)
-
-A ruin-and-recreate local search (``mtsp_env._sisr``) from greedy insertion or from given tours. Numba compiles its
-kernels when they are first needed, once per machine, and keeps them on disk (``__pycache__``, or ``NUMBA_CACHE_DIR``).
+"""The reference solver: simulated annealing by ruin and recreate.
 
 Kept because no library does as well by the makespan. On five uniform instances each of n, m = 50, 5; 100, 5; 200, 10
 and one busy core, PyVRP 0.14, whose limit on each tour a bisection brings down from the same greedy insertion, was
@@ -16,25 +11,18 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-import os
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-try:
-    from mtsp_env import _sisr
-except ModuleNotFoundError as error:
-    if error.name != "numba":
-        raise
-    raise ModuleNotFoundError(
-        "mtsp_env.reference needs Numba: pip install 'mtsp-env[reference]'", name="numba"
-    ) from error
-
-from mtsp_env._search import as_order, as_tours, new_search, rest_as_order, set_off
-from mtsp_env.instance import Instance, Tours, check_count, check_nodes
-from mtsp_env.tours import check_prefixes, check_tours, farthest_trip, is_closed, makespan, tour_lengths
+from mtsp_env.checks import check_count, check_seconds
+from mtsp_env.instance import Instance, Tours, check_arrays
+from mtsp_env.machine import usable_cores
+from mtsp_env.reference import sisr
+from mtsp_env.reference.search import as_order, as_tours, new_search, rest_as_order, set_off
+from mtsp_env.tours import check_prefixes, check_tours, farthest_trip, is_closed, makespan, path_lengths
 
 ITERATIONS_PER_NODE = 500  # where neither seconds nor iterations are given
 HOT, COLD = 0.1, 0.0025  # first and last temperature, in units of makespan * sqrt(m / n), a few mean legs
@@ -92,7 +80,7 @@ def improve(
                 raise ValueError(f"tour {agent} must begin with its prefix {prefix}, got {tour}")
     compile_kernels()
     found = _solve(instance.nodes, instance.n_agents, tours, seconds, iterations, seed, prefixes=prefixes)
-    if tours is not None and makespan(instance.nodes, tours) <= makespan(instance.nodes, found):
+    if tours is not None and makespan(instance, tours) <= makespan(instance, found):
         return tours
     return found
 
@@ -120,10 +108,10 @@ def improve_batch(
     if nodes.ndim != 3:
         raise ValueError(f"nodes must have shape (B, n, 2), got {nodes.shape}")
     if len(nodes):
-        check_nodes(nodes)
+        check_arrays({"nodes": nodes}, n_agents)
     check_count("n_agents", n_agents, minimum=1)
     _check_search(iterations, seed)
-    threads = _usable_cores() if threads is None else threads
+    threads = len(usable_cores()) if threads is None else threads
     check_count("threads", threads, minimum=1)
     begun: list[Tours | None] = [None] * len(nodes)
     if prefixes is not None:
@@ -136,23 +124,10 @@ def improve_batch(
         return list(pool.map(lambda row, prefixes: solve(row, prefixes=prefixes), nodes, begun))
 
 
-def check_seconds(name: str, value: float) -> None:
-    """Raise ValueError unless ``value`` is a finite number above 0."""
-    number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
-    if not (number and math.isfinite(value) and value > 0):
-        raise ValueError(f"{name} must be a finite number above 0, got {value!r}")
-
-
 def _check_search(iterations: int | None, seed: int) -> None:
     if iterations is not None:
         check_count("iterations", iterations, minimum=0)
     check_count("seed", seed, minimum=0)
-
-
-def _usable_cores() -> int:
-    if hasattr(os, "sched_getaffinity"):  # Linux: what a container or a batch system leaves us
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 @functools.cache
@@ -180,7 +155,7 @@ def _solve(
         search = new_search(nodes, min(n_agents, len(nodes) - 1), seed)
         start = None if tours is None else as_order(tours, len(search.best) - 1)
         _optimise(search, 1, start, enough, tidy, seconds, iterations, started)
-        return as_tours(_sisr.best_order(search), n_agents)
+        return as_tours(sisr.best_order(search), n_agents)
 
     heads = [prefix[-1] for prefix in prefixes if prefix[-1] != 0]
     free = sorted(set(range(1, len(nodes))).difference(*prefixes))
@@ -188,11 +163,11 @@ def _solve(
         return [prefix if is_closed(prefix) else [*prefix, 0] for prefix in prefixes]
     kept = [0, *heads, *free]  # what is left of the instance; its nodes are numbered anew
     search = new_search(nodes[kept], n_agents, seed)
-    set_off(search, prefixes, tour_lengths(nodes, prefixes))
-    enough = max(enough, _sisr.sum_lengths(search))  # of everybody going home at once
+    set_off(search, prefixes, path_lengths(nodes, prefixes))
+    enough = max(enough, sisr.sum_lengths(search))  # of everybody going home at once
     start = None if tours is None else rest_as_order(tours, prefixes, kept)
     _optimise(search, 1 + len(heads), start, enough, tidy, seconds, iterations, started)
-    rest = as_tours(_sisr.best_order(search), n_agents)
+    rest = as_tours(sisr.best_order(search), n_agents)
     return [
         prefix if is_closed(prefix) else [*prefix, *(kept[node] for node in tour[1 if prefix == [0] else 2 :])]
         for prefix, tour in zip(prefixes, rest, strict=True)
@@ -200,7 +175,7 @@ def _solve(
 
 
 def _optimise(
-    search: _sisr.Search,
+    search: sisr.Search,
     first_free: int,
     start: np.ndarray | None,
     enough: float,
@@ -212,19 +187,19 @@ def _optimise(
     """Put the cities from ``first_free`` on onto the tours, or start from better ones (``start``), and improve them."""
     n = len(search.near)
     home = np.hypot(search.x[:n] - search.x[0], search.y[:n] - search.y[0])
-    _sisr.insert_greedily(search, first_free + np.argsort(-home[first_free:], kind="stable"))
-    greedy = best = _sisr.sum_lengths(search)
+    sisr.insert_greedily(search, first_free + np.argsort(-home[first_free:], kind="stable"))
+    greedy = best = sisr.sum_lengths(search)
     if start is not None:
-        inserted = _sisr.best_order(search)
-        _sisr.load_tours(search, start)
-        best = _sisr.sum_lengths(search)
+        inserted = sisr.best_order(search)
+        sisr.load_tours(search, start)
+        best = sisr.sum_lengths(search)
         if best >= greedy:
-            _sisr.load_tours(search, inserted)
-            best = _sisr.sum_lengths(search)
+            sisr.load_tours(search, inserted)
+            best = sisr.sum_lengths(search)
 
     unit, weight, enough = greedy * math.sqrt(len(search.length) / n), 0.0, enough + CLOSED
     if tidy:
-        weight, enough = _sisr.TOTAL_WEIGHT, -math.inf
+        weight, enough = sisr.TOTAL_WEIGHT, -math.inf
         best += weight * float(search.length.sum())
     if seconds is None and iterations is None:
         iterations = ITERATIONS_PER_NODE * n
@@ -232,7 +207,7 @@ def _optimise(
 
 
 def _anneal(
-    search: _sisr.Search,
+    search: sisr.Search,
     best: float,
     enough: float,
     weight: float,
@@ -243,7 +218,7 @@ def _anneal(
 ) -> None:
     """Anneal between HOT and COLD ``unit``s of length until ``seconds`` after ``started``, or for ``iterations``.
 
-    ``best``, ``enough`` and ``weight`` are those of ``_sisr.anneal``.
+    ``best``, ``enough`` and ``weight`` are those of ``sisr.anneal``.
     """
     if iterations == 0:
         return
@@ -256,13 +231,13 @@ def _anneal(
         return max((now - started) / seconds, done / limit)
 
     for begin, end in itertools.pairwise(ROUNDS):
-        _sisr.load_tours(search, _sisr.best_order(search))
+        sisr.load_tours(search, sisr.best_order(search))
         while best > enough and (over := progress(now, done)) < end:
             turn = min(turn_seconds, started + end * seconds - now) / per_iteration
             turn = int(max(min(turn, math.ceil(end * limit) - done), 1))
             then = min(progress(now + turn * per_iteration, done + turn), end)
             hot, cold = (HOT * (COLD / HOT) ** ((p - begin) / (end - begin)) for p in (over, then))
-            best = _sisr.anneal(search, turn, hot * unit, cold * unit, best, enough, weight)
+            best = sisr.anneal(search, turn, hot * unit, cold * unit, best, enough, weight)
             before, now = now, time.perf_counter()
             per_iteration = max((now - before) / turn, 1e-7)  # a coarse clock may not have moved
             done += turn

@@ -1,25 +1,25 @@
 """A search of the reference solver: its arrays from an instance, from tours and from prefixes, and tours from them.
 
-``mtsp_env._sisr`` holds what is compiled, ``mtsp_env.reference`` what is called.
+``sisr`` holds what is compiled, ``solver`` what is called.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from mtsp_env import _sisr
 from mtsp_env.instance import Tours
+from mtsp_env.reference import sisr
 from mtsp_env.tours import is_closed
 
 
-def new_search(nodes: np.ndarray, n_agents: int, seed: int) -> _sisr.Search:
+def new_search(nodes: np.ndarray, n_agents: int, seed: int) -> sisr.Search:
     """A search over ``nodes`` (n, 2) whose tours are empty."""
     n, size = len(nodes), len(nodes) + n_agents
     xy = np.concatenate([nodes, np.repeat(nodes[:1], n_agents, axis=0)])  # (N, 2)
     x, y = np.ascontiguousarray(xy[:, 0]), np.ascontiguousarray(xy[:, 1])
-    near, near_distance = _sisr.nearest_cities(x, y, n, min(_sisr.N_NEAR, n - 2))
+    near, near_distance = sisr.nearest_cities(x, y, n, min(sisr.N_NEAR, n - 2))
     itself = np.arange(size, dtype=np.int32)  # an empty tour: the depot before and after itself
-    return _sisr.Search(
+    return sisr.Search(
         x=x,
         y=y,
         near=near,
@@ -43,7 +43,7 @@ def new_search(nodes: np.ndarray, n_agents: int, seed: int) -> _sisr.Search:
     )
 
 
-def set_off(search: _sisr.Search, prefixes: Tours, driven: np.ndarray) -> None:
+def set_off(search: sisr.Search, prefixes: Tours, driven: np.ndarray) -> None:
     """Put the agents where their ``prefixes`` end: nodes 1, 2, ... of ``search`` are the last ones that are cities."""
     depot, head, order = len(search.near), 1, []
     for agent, prefix in enumerate(prefixes):
@@ -55,11 +55,11 @@ def set_off(search: _sisr.Search, prefixes: Tours, driven: np.ndarray) -> None:
             search.head[agent] = depot + agent
         order.append(0)
     search.driven[:] = driven
-    _sisr.load_tours(search, np.array(order, dtype=np.int64))
+    sisr.load_tours(search, np.array(order, dtype=np.int64))
 
 
 def rest_as_order(tours: Tours, prefixes: Tours, kept: list[int]) -> np.ndarray:
-    """What is left of ``tours``, which begin with ``prefixes``, as ``_sisr.load_tours`` takes it."""
+    """What is left of ``tours``, which begin with ``prefixes``, as ``sisr.load_tours`` takes it."""
     number = {node: i for i, node in enumerate(kept)}
     rests = [tour[max(0, len(prefix) - 1) :] for tour, prefix in zip(tours, prefixes, strict=True)]
     return np.array([i for rest in rests for i in [*(number[node] for node in rest if node != 0), 0]], dtype=np.int64)
@@ -74,7 +74,7 @@ def _spread(seed: int) -> int:
 
 
 def as_order(tours: Tours, size: int) -> np.ndarray:
-    """``tours`` as ``_sisr.load_tours`` takes them, int64 (size,): idle agents last.
+    """``tours`` as ``sisr.load_tours`` takes them, int64 (size,): idle agents last.
 
     Passing the depot in between only makes a tour longer, so it is left out.
     """
@@ -84,7 +84,7 @@ def as_order(tours: Tours, size: int) -> np.ndarray:
 
 
 def as_tours(order: np.ndarray, n_agents: int) -> Tours:
-    """Tours from ``_sisr.best_order``; agents that it leaves out stay at home."""
+    """Tours from ``sisr.best_order``; agents that it leaves out stay at home."""
     tours: Tours = [[0]]
     for node in order.tolist():
         tours[-1].append(node)

@@ -1,0 +1,96 @@
+"""Command lines read by tyro: kinds of arguments, and errors of one line.
+
+tyro draws a box around an error and exits with 2; the command ``mtsp`` prints one line instead.
+"""
+
+from __future__ import annotations
+
+import functools
+import io
+import itertools
+import math
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stderr
+from typing import Any, NoReturn
+
+try:
+    import tyro
+except ImportError as missing:
+    sys.exit(f'mtsp: error: the command needs tyro ({missing}): pip install "mtsp-env[dan]"')
+from tyro.conf import Positional, arg
+from tyro.constructors import PrimitiveConstructorSpec
+
+__all__ = ["SECONDS", "Positional", "arg", "default", "parse", "refuse", "whole"]
+
+Command = Callable[..., None]
+
+
+def parse(commands: Sequence[Command], description: str, argv: Sequence[str]) -> Callable[[], None]:
+    """The command that ``argv`` names, bound to its arguments.
+
+    Exits with 0 after ``--help``, and with 2 and one line on stderr if the command line is bad.
+    """
+    app = tyro.extras.SubcommandApp()
+    for command in commands:
+        summary = (command.__doc__ or "").partition("\n")[0] if argv in ([], ["-h"], ["--help"]) else None
+        app.command(name=command.__name__, help=summary)(_deferred(command))
+    report = io.StringIO()
+    try:
+        with redirect_stderr(report):
+            return app.cli(prog="mtsp", description=description, args=argv, config=(tyro.conf.FlagCreatePairsOff,))
+    except SystemExit as end:
+        if end.code in (None, 0):
+            raise
+        refuse(_without_box(report.getvalue()))
+
+
+def refuse(message: str) -> NoReturn:
+    """Exit with 2 and ``message`` as one line on stderr."""
+    sys.stderr.write(f"mtsp: error: {' '.join(message.split())}\n")
+    sys.exit(2)
+
+
+def whole(minimum: int, metavar: str) -> Any:
+    """An annotation for a whole number from ``minimum`` to 2^63 - 1."""
+    return _number(int, lambda value: minimum <= value < 2**63, f"a whole number of at least {minimum}", metavar)
+
+
+def default(text: str) -> Any:
+    """An annotation for what the help says about an argument's default."""
+    return arg(help_behavior_hint=f"(default: {text})")
+
+
+def _number(convert: Callable[[str], float], valid: Callable[[float], bool], expected: str, metavar: str) -> Any:
+    def read(arguments: list[str]) -> float:
+        try:
+            value = convert(arguments[0])
+        except ValueError:
+            value = math.nan
+        if not valid(value):
+            raise ValueError(f"must be {expected}, got {arguments[0]!r}")
+        return value
+
+    return PrimitiveConstructorSpec(1, metavar, read, lambda value: True, lambda value: [str(value)])
+
+
+SECONDS = _number(
+    float, lambda value: math.isfinite(value) and value > 0, "a finite number of seconds above 0", "SECONDS"
+)
+"""An annotation for a time."""
+
+
+def _deferred(command: Command) -> Callable[..., Callable[[], None]]:
+    """tyro calls what it parses: this binds the arguments, so that the command runs after parsing."""
+
+    @functools.wraps(command)
+    def bind(*arguments: Any, **options: Any) -> Callable[[], None]:
+        return functools.partial(command, *arguments, **options)
+
+    return bind
+
+
+def _without_box(report: str) -> str:
+    """The message inside the box that tyro draws: the lines between its title and its first ruler."""
+    lines = [line.strip("│╭╮╰╯ ") for line in report.splitlines()[1:]]
+    return " ".join(itertools.takewhile(lambda line: line == "" or line.strip("─"), lines))

@@ -1,0 +1,135 @@
+"""Games of one instance side by side, played by any policy, as ``solve`` needs them.
+
+``episode.rollout`` samples from torch's global generator and sets TorchRL's exploration type, both of which belong to
+the whole process. This loop draws from a generator that it is given and sets nothing, so that threads do not disturb
+each other. On a CPU the rules run in NumPy, which is faster than torch for arrays of these sizes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from torch import Tensor
+
+from dan_policy.actor import Key, Network, network_keys
+from dan_policy.symmetry import views
+from mtsp_env import rules
+from mtsp_env.instance import Instance, Problem, Tours, batch
+
+Logits = Callable[[rules.State, rules.Observation], Tensor]
+"""What the deciding agents see, and the state of their games -> logits (B, n)."""
+
+
+def begin(
+    instance: Instance,
+    game: rules.Rules,
+    prefixes: Sequence[Sequence[int]] = (),
+    rows: int = 1,
+    augment: bool = False,
+    device: torch.device | str = "cpu",
+) -> rules.State:
+    """``rows`` times the moment at which all ``prefixes`` are driven, by the game's own rules and clock.
+
+    Args:
+        instance: the problem.
+        game: its rules.
+        prefixes: the beginning of each agent's tour (``mtsp_env.tours.check_prefixes``); none: all are at the depot.
+        rows: number of games.
+        augment: the i-th game sees the instance in the square's symmetry i modulo 8.
+        device: "cpu" gives NumPy arrays, others torch tensors.
+    """
+    problem = batch([instance] * rows)
+    if augment:
+        nodes = views(torch.tensor(instance.nodes), rows).numpy()  # (rows, n, 2)
+        problem = Problem(problem.n_agents, {**problem.arrays, "nodes": nodes})
+    state, left = rules.start(problem), [list(prefix[1:]) for prefix in prefixes]
+    while any(left):
+        agent = min((a for a in range(len(left)) if left[a]), key=lambda a: (state.ready[0, a], a))
+        action, *left[agent] = left[agent]
+        state = rules.depart(state, game, np.full(rows, action), np.full(rows, agent))
+    if torch.device(device).type == "cpu":
+        return state
+    tensors = {name: torch.as_tensor(array, device=device) for name, array in state.arrays().items()}
+    return rules.state_from_arrays(tensors, instance.n_agents)
+
+
+@torch.no_grad()
+def play(
+    policy: Network | TensorDictModuleBase,
+    state: rules.State,
+    game: rules.Rules,
+    generator: torch.Generator | None = None,
+) -> rules.State:
+    """The state at the end of the games that ``policy`` plays from ``state``.
+
+    Args:
+        policy: a network, or an actor that reads the observation and writes ``action``.
+        state: one game per row, by the depot rule "final", so that every game ends.
+        game: the rules.
+        generator: on the state's device; actions are drawn from it. None takes the likeliest actions.
+
+    Raises:
+        ValueError: a policy that reads unknown keys, whose logits have a wrong shape or are not numbers, or that writes
+            an illegal action.
+    """
+    logits_of = _logits_of(policy)
+    while not rules.all_visited(state).all():
+        seen = rules.observe(state, game)
+        mask = torch.as_tensor(seen.action_mask)
+        logits = logits_of(state, seen)
+        if logits.shape != mask.shape:
+            raise ValueError(f"the policy must return logits of shape {tuple(mask.shape)}, got {tuple(logits.shape)}")
+        logits = logits.masked_fill(~mask, -torch.inf)
+        best, action = logits.max(1)  # (B,) each
+        if not best.isfinite().all():
+            raise ValueError(f"the policy's logits must be finite for at least one legal node, got {float(best.min())}")
+        if generator is not None:
+            action = torch.multinomial(logits.float().softmax(1), 1, generator=generator)[:, 0]
+        state = rules.depart(state, game, action.numpy() if isinstance(state.ready, np.ndarray) else action)
+    return state
+
+
+def best_tours(state: rules.State) -> Tours:
+    """The tours of the game with the smallest makespan, the first of equals."""
+    row = int(rules.makespan(state).argmin())
+    visits, destination = (torch.as_tensor(array[row]).cpu().numpy() for array in (state.visits, state.destination))
+    return rules.tours(visits, destination)
+
+
+def _logits_of(policy: Network | TensorDictModuleBase) -> Logits:
+    if isinstance(policy, ProbabilisticTensorDictSequential):  # without `get_dist`, which sets the exploration type
+        return lambda state, seen: policy.build_dist_from_params(policy.det_part(_tensordict(state, seen))).logits
+    if isinstance(policy, TensorDictModuleBase):
+        return lambda state, seen: _logits_of_choice(policy(_tensordict(state, seen)))
+    keys = network_keys(policy)
+    return lambda state, seen: policy(*(_tensor(state, seen, key) for key in keys))
+
+
+def _logits_of_choice(decided: TensorDictBase) -> Tensor:
+    """Logits that leave no choice but the ``action`` (B,) that an actor without a distribution has written."""
+    action, mask = decided["action"], decided["action_mask"]
+    if not mask.gather(1, action[:, None]).all():
+        raise ValueError(f"the policy chose an illegal action, got {action.tolist()}")
+    return torch.full(mask.shape, -torch.inf, device=mask.device).scatter(1, action[:, None], 0.0)
+
+
+def _tensor(state: rules.State, seen: rules.Observation, key: Key) -> Tensor:
+    """What a network reads under ``key``: a part of the observation, or of the state under "game"."""
+    if isinstance(key, str) and key in seen._fields:
+        return torch.as_tensor(getattr(seen, key))
+    arrays = state.arrays()
+    if isinstance(key, tuple) and len(key) == 2 and key[0] == "game" and key[1] in arrays:
+        return torch.as_tensor(arrays[key[1]])
+    choices = [*seen._fields, *(("game", name) for name in arrays)]
+    raise ValueError(f"the network reads {key!r}; choose from {choices}")
+
+
+def _tensordict(state: rules.State, seen: rules.Observation) -> TensorDict:
+    observation = {name: torch.as_tensor(array) for name, array in seen._asdict().items()}
+    game = {name: torch.as_tensor(array) for name, array in state.arrays().items()}
+    size = [observation["visited"].shape[0]]
+    return TensorDict({**observation, "game": TensorDict(game, size)}, size)

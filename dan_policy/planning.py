@@ -1,0 +1,237 @@
+"""From an instance to tours in one call."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from copy import copy, deepcopy
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import lru_cache, partial
+from pathlib import Path
+from threading import Lock
+from typing import Any, Literal, get_args
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+
+from dan_policy.actor import Network
+from dan_policy.episode import Decode, find_device
+from dan_policy.games import begin, best_tours, play
+from dan_policy.heuristics import bfloat16_pays, default_view, sampling_clip
+from dan_policy.registry import find, load, network_name
+from dan_policy.symmetry import SYMMETRIES
+from mtsp_env import rules
+from mtsp_env.checks import check_count, check_seconds
+from mtsp_env.instance import Instance, Tours
+from mtsp_env.tours import check_prefixes, check_tours, makespan
+
+Precision = Literal["auto", "float32", "bfloat16"]
+SPEED = 0.01  # distance per tick (the paper's Delta g in tests, Sec. 6)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The tours that ``solve`` planned.
+
+    Attributes:
+        tours: one per agent, each from depot to depot.
+        makespan: the longest tour, in unit-square units; times ``instance.scale`` it is in the source's.
+        seconds: wall-clock time of the planning, improvement included, without loading weights or compiling kernels.
+        method: for tables, e.g. "dan(g.)", "dan(s.64)", "dan(g.x8)" (augmented) or "dan(g.)+improve(1 s)".
+    """
+
+    tours: Tours
+    makespan: float
+    seconds: float
+    method: str
+
+
+@dataclass(frozen=True)
+class SolveOptions:
+    """How ``solve`` plans. ``clip``, ``view`` and ``prune_visited`` need a network whose ``config`` has these fields.
+
+    Attributes:
+        decode: "greedy" plays one game of likeliest actions; "sample" plays ``samples`` games of drawn actions and
+            takes the best (paper, Sec. 6: DAN(g.) and DAN(s.64)).
+        samples: games to sample, at least 1.
+        augment: the games see the instance in the square's eight symmetries in turn, and the best counts (Kwon et al.
+            2020, POMO): "greedy" plays eight games instead of one, "sample" as many as without.
+        seed: of the samples and of the improvement, from 0 to 2^63 - 1. The same call gives the same tours on the same
+            machine, except with ``improve``, which goes by the clock.
+        device: None takes a GPU if there is one.
+        improve: seconds, above 0, for which ``mtsp_env.reference.improve`` continues from the policy's tours; it never
+            makes them worse (extra ``reference``). None leaves the tours as they are.
+        precision: of the network's matrix products. "auto" takes "bfloat16" if the network supports it and
+            ``heuristics.bfloat16_pays`` (about twice as fast for 64 samples on CPUs with AMX or AVX-512 BF16, equally
+            good tours), else "float32", whose tours do not depend on the hardware.
+        clip: C to sample with, above 0: the larger it is, the more often the likelier actions are drawn. None:
+            ``heuristics.sampling_clip``.
+        view: how many cities a deciding agent sees at most, the nearest unvisited ones, at least 1; seeing fewer is
+            faster. A DAN needs ``prune_visited`` for it. None: the network's own, or else ``heuristics.default_view``,
+            which suits networks trained on small instances; one trained on larger ones wants ``view=n_nodes``.
+        prune_visited: whether visited cities are dropped before the encoders. None: as the network was trained.
+
+    Raises:
+        ValueError: a value outside its range.
+    """
+
+    decode: Decode = "greedy"
+    samples: int = 64
+    augment: bool = False
+    seed: int = 0
+    device: torch.device | str | None = None
+    improve: float | None = None
+    precision: Precision = "auto"
+    clip: float | None = None
+    view: int | None = None
+    prune_visited: bool | None = None
+
+    def __post_init__(self) -> None:
+        for name, choices in (("decode", get_args(Decode)), ("precision", get_args(Precision))):
+            if getattr(self, name) not in choices:
+                raise ValueError(f"unknown {name} {getattr(self, name)!r}; choose from {list(choices)}")
+        check_count("samples", self.samples, minimum=1)
+        check_count("seed", self.seed, minimum=0)
+        if self.seed >= 2**63:
+            raise ValueError(f"seed must be below 2^63, got {self.seed}")
+        if self.improve is not None:
+            check_seconds("improve", self.improve)
+        if self.clip is not None and not self.clip > 0:
+            raise ValueError(f"clip must be above 0, got {self.clip!r}")
+        if self.view is not None:
+            check_count("view", self.view, minimum=1)
+
+    @property
+    def games(self) -> int:
+        """Games played side by side."""
+        return self.samples if self.decode == "sample" else SYMMETRIES if self.augment else 1
+
+
+def solve(
+    instance: Instance,
+    policy: str | os.PathLike[str] | Network | TensorDictModuleBase = "default",
+    options: SolveOptions | None = None,
+    *,
+    prefixes: Sequence[Sequence[int]] | None = None,
+    **changes: Any,
+) -> Solution:
+    """Plan one tour per agent with a policy, and improve the tours if asked to.
+
+    The games are played by the depot rule "final", so that tours are complete whatever the policy does. Neither the
+    policy nor any setting or random generator of the process is changed, and calls may run in several threads at once.
+
+    >>> solve(instance, decode="sample", samples=128, seed=1)
+
+    Args:
+        instance: the problem.
+        policy: the name of a shipped model, a file that ``dan_policy.save`` wrote, any network or any actor (see
+            ``make_actor``). A file of a network of one's own is loaded first: ``load(file, network=...)``.
+        options: how to plan; None: ``SolveOptions()``.
+        prefixes: the beginning of each agent's tour (``mtsp_env.tours.check_prefixes``), to plan the remaining tours of
+            a team that is already under way. None: all agents are at the depot.
+        **changes: fields of ``SolveOptions`` that replace those of ``options``.
+
+    Raises:
+        ImportError: ``improve`` without Numba.
+        OSError: no such weights.
+        TypeError: an option that does not exist.
+        ValueError: bad weights, an option outside its range, or one that the policy does not have.
+    """
+    options = replace(options or SolveOptions(), **changes)
+    begun = [] if prefixes is None else check_prefixes(instance, prefixes)
+    improve = _improvement(options, begun)
+    device = find_device(options.device)
+    policy = _placed(_loaded(policy, device), device)
+    name, policy = network_name(policy), _configured(policy, options, instance.n_nodes)
+    generator = torch.Generator(device).manual_seed(options.seed) if options.decode == "sample" else None
+
+    start = time.perf_counter()
+    game = rules.make_rules(instance.n_nodes, instance.n_agents, SPEED, "final", "sparse", None)
+    state = begin(instance, game, begun, options.games, options.augment, device)
+    with _autocast(policy, options, instance.n_nodes, device):
+        tours = best_tours(play(policy, state, game, generator))
+    tours = improve(instance, tours)
+    seconds = time.perf_counter() - start
+
+    check_tours(instance, tours)
+    return Solution(tours, makespan(instance, tours), seconds, f"{name}{_decoding(options)}")
+
+
+def _improvement(options: SolveOptions, prefixes: Tours) -> Callable[[Instance, Tours], Tours]:
+    """The reference solver for ``improve`` seconds, its kernels compiled; without ``improve``, nothing."""
+    if options.improve is None:
+        return lambda instance, tours: tours
+    from mtsp_env import reference  # needs Numba
+
+    reference.compile_kernels()
+    return partial(reference.improve, seconds=options.improve, seed=options.seed, prefixes=prefixes or None)
+
+
+def _loaded(policy: Any, device: torch.device) -> Network | TensorDictModuleBase:
+    """The policy itself, or the network behind a name or file, which is read once per process and file version."""
+    if not isinstance(policy, (str, os.PathLike)):
+        return policy
+    file = find(policy)
+    with _load_lock:
+        return _read(file, file.stat().st_mtime_ns, device)
+
+
+_load_lock = Lock()  # threads that start together do not all read the same file
+
+
+@lru_cache(maxsize=4)
+def _read(file: Path, _modified: int, device: torch.device) -> nn.Module:
+    return load(file, device)
+
+
+def _placed(policy: Any, device: torch.device) -> Any:
+    """The policy on ``device`` in evaluation mode: itself if it already is, else a copy, because it is the caller's."""
+    if not isinstance(policy, nn.Module):
+        return policy
+    tensors = [*policy.parameters(), *policy.buffers()]
+    networks = (module for module in policy.modules() if not isinstance(module, _WRAPPERS))
+    if any(tensor.device != device for tensor in tensors) or any(module.training for module in networks):
+        return deepcopy(policy).to(device).eval()
+    return policy
+
+
+_WRAPPERS = (TensorDictModuleBase, nn.ModuleList)  # around an actor's network: their own mode changes nothing
+
+
+def _configured(policy: Any, options: SolveOptions, n_nodes: int) -> Any:
+    """The policy, or a shallow copy of it that shares its parameters and has the configuration of ``options``."""
+    config: Any = getattr(policy, "config", None)
+    known = {field.name for field in fields(config)} if is_dataclass(config) else set()
+    given = {"tanh_clip": options.clip, "view": options.view, "prune_visited": options.prune_visited}
+    changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    for name in changes.keys() - known:
+        option = "clip" if name == "tanh_clip" else name
+        raise ValueError(f"{option} needs a network whose config has the field {name!r}, got {network_name(policy)!r}")
+    if "tanh_clip" in known and options.decode == "sample":
+        changes.setdefault("tanh_clip", sampling_clip(config.tanh_clip, n_nodes, options.augment))
+    prunes = changes.get("prune_visited", getattr(config, "prune_visited", True))
+    if "view" in known and config.view is None and prunes:
+        changes.setdefault("view", default_view(n_nodes))
+    if not changes:
+        return policy
+    policy = copy(policy)
+    policy.config = replace(config, **changes)
+    return policy
+
+
+def _autocast(policy: Any, options: SolveOptions, n_nodes: int, device: torch.device) -> torch.autocast:
+    """The precision as a context. It caches no weights: PyTorch's cache of them is shared by all threads."""
+    view = getattr(getattr(policy, "config", None), "view", None) or n_nodes
+    use_bfloat16 = options.precision == "bfloat16"
+    if options.precision == "auto" and getattr(policy, "supports_bfloat16", False):
+        use_bfloat16 = bfloat16_pays(device, options.games * min(n_nodes, 1 + view))
+    return torch.autocast(device.type, torch.bfloat16, enabled=use_bfloat16, cache_enabled=False)
+
+
+def _decoding(options: SolveOptions) -> str:
+    """In the paper's notation: (g.), (s.64); with "x8" if augmented."""
+    decode = "g." if options.decode == "greedy" else f"s.{options.samples}"
+    improve = "" if options.improve is None else f"+improve({options.improve:g} s)"
+    return f"({decode}{'x8' if options.augment else ''}){improve}"

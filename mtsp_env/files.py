@@ -1,0 +1,113 @@
+"""Files of our own: instances and tours as JSON, and the one way in which this project writes a file."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from mtsp_env.instance import FIELDS, Instance, Tours
+
+
+@contextmanager
+def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
+    """A temporary path beside ``path`` to write to; it replaces ``path`` when the block ends without an error.
+
+    A failure or a crash leaves the older file as it was.
+
+    >>> with atomic_write("tours.json") as temporary:
+    ...     temporary.write_text("{}")
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_json(path: str | os.PathLike, data: dict) -> None:
+    """Write one JSON object, atomically."""
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps(data), encoding="utf-8")
+
+
+def read_json(path: str | os.PathLike, keys: Sequence[str]) -> dict:
+    """Read a JSON object that has at least ``keys``.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: not such a file.
+    """
+    try:
+        data = json.loads(Path(path).read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:  # not JSON, not text, or nested without end
+        raise ValueError(f"{path}: not a JSON file ({error})") from error
+    if not isinstance(data, dict) or not set(keys) <= data.keys():
+        raise ValueError(f"{path}: expected a JSON object with the keys {list(keys)}")
+    return data
+
+
+def write_instance(path: str | os.PathLike, instance: Instance) -> None:
+    """Write an instance as JSON: {"name", "n_agents", "scale", "nodes"} and the fields of its world.
+
+    JSON has no infinity; ``null`` stands for it.
+    """
+    arrays = {name: _replace(array.tolist(), math.inf, None) for name, array in instance.arrays().items()}
+    write_json(path, {"name": instance.name, "n_agents": instance.n_agents, "scale": instance.scale, **arrays})
+
+
+def read_instance(path: str | os.PathLike, n_agents: int | None = None) -> Instance:
+    """Read what ``write_instance`` wrote; ``n_agents``, if given, replaces the file's number of agents.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: not such a file, or not a valid instance.
+    """
+    data = read_json(path, keys=("nodes", "n_agents"))
+    arrays = {}
+    for name in FIELDS:
+        if data.get(name) is not None:
+            may_be_infinite = FIELDS[name].high == math.inf
+            arrays[name] = _replace(data[name], None, math.inf) if may_be_infinite else data[name]
+    try:
+        return Instance(
+            n_agents=data["n_agents"] if n_agents is None else n_agents,
+            name=data.get("name", ""),
+            scale=data.get("scale", 1.0),
+            **arrays,
+        )
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _replace(values: Any, old: Any, new: Any) -> Any:
+    """Nested lists with every ``old`` replaced by ``new``."""
+    if isinstance(values, list):
+        return [_replace(value, old, new) for value in values]
+    return new if values == old else values
+
+
+def write_tours(path: str | os.PathLike, tours: Tours, **extra: object) -> None:
+    """Write tours as JSON: {"tours": [[0, ..., 0], ...]} and the JSON values of ``extra`` beside them."""
+    write_json(path, {"tours": [[int(node) for node in tour] for tour in tours], **extra})
+
+
+def read_tours(path: str | os.PathLike) -> Tours:
+    """Read the tours that ``write_tours`` wrote; ``tours.check_tours`` says whether they solve an instance.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: not such a file.
+    """
+    tours = read_json(path, keys=("tours",))["tours"]
+    if not isinstance(tours, list) or not all(
+        isinstance(tour, list) and all(type(node) is int for node in tour) for tour in tours
+    ):
+        raise ValueError(f"{path}: 'tours' must be a list of lists of node numbers")
+    return tours
