@@ -22,7 +22,7 @@ from benchmarks.run import describe_machine
 from benchmarks.suite import SEED, Cell
 from dan_policy import DANConfig, make_actor
 from dan_policy.episode import Decode, rollout
-from dan_policy.solution import SPEED
+from dan_policy.planning import SPEED
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.tours import makespan
 from train.config import ImitateConfig

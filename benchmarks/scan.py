@@ -13,14 +13,14 @@ from benchmarks.files import replace_text
 from benchmarks.run import describe_machine
 from benchmarks.suite import Cell
 from dan_policy import Solution, solve
-from dan_policy.solution import sample_clip
+from dan_policy.heuristics import sampling_clip
 from mtsp_env.checks import check_count
 from mtsp_env.instance import Instance
 
 RESULTS = Path(__file__).parent / "results"
 SEED = 123  # of no test set and of no training
 CLIP_SIZES = ("50x5", "50x10", "100x5", "100x10", "200x10")
-FACTORS = (1.0, 0.5, 2.0)  # of sample_clip's own C
+FACTORS = (1.0, 0.5, 2.0)  # of sampling_clip's own C
 VIEW_SIZES = ("200x10", "300x10", "500x10", "1000x10")
 VIEWS = (200, 100, 50)
 
@@ -33,7 +33,7 @@ def clip(
     augment: bool = False,
     out: Path = RESULTS / "clip.md",
 ) -> None:
-    """Sample with the C that ``sample_clip`` gives, half and twice of it, on instances of seed 123; write a table.
+    """Sample with the C that ``sampling_clip`` gives, half and twice of it, on instances of seed 123; write a table.
 
     Args:
         sizes: such as 50x5.
@@ -48,16 +48,16 @@ def clip(
     """
 
     def plan(instance: Instance, seed: int, value: float) -> Solution:
-        return solve(instance, policy, "sample", samples, seed, augment=augment, clip=value)
+        return solve(instance, policy, decode="sample", samples=samples, seed=seed, augment=augment, clip=value)
 
     cells = _cells(sizes, instances)
     head = (
         f"# Samples over C: best of {samples}{' in eight symmetries' if augment else ''}",
-        f"the C of `dan_policy.solution.sample_clip`, which stands first, in %, ± standard error; "
+        f"the C of `dan_policy.heuristics.sampling_clip`, which stands first, in %, ± standard error; "
         f'weights "{policy}". Made by `python -m benchmarks clip --sizes {" ".join(sizes)} --instances {instances} '
         f"--samples {samples}{' --augment' if augment else ''}`.",
     )
-    values = [[factor * sample_clip(10.0, cell.n_nodes, augment) for factor in FACTORS] for cell in cells]
+    values = [[factor * sampling_clip(10.0, cell.n_nodes, augment) for factor in FACTORS] for cell in cells]
     _write(out, *head, "C", cells, values, plan)
 
 

@@ -176,9 +176,9 @@ def test_other_policies_keep_their_precision(monkeypatch):
 
 
 def test_improvement_without_numba_names_the_extra_before_it_plans(network, monkeypatch):
-    for name in ("reference", "_sisr"):
-        monkeypatch.delattr(mtsp_env, name, raising=False)
-        monkeypatch.delitem(sys.modules, f"mtsp_env.{name}", raising=False)
+    monkeypatch.delattr(mtsp_env, "reference", raising=False)
+    for name in [name for name in sys.modules if name.startswith("mtsp_env.reference")]:
+        monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "numba", None)
     monkeypatch.setattr(planning, "play", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'mtsp-env\[reference\]'"):
@@ -300,6 +300,27 @@ def test_the_options_of_a_network_of_ones_own_are_fields_of_its_config():
     seen = [config for number, config in enumerate(own.seen) if config not in own.seen[:number]]
     assert seen == [OwnConfig(tanh_clip=2.4), OwnConfig(prune_visited=True, view=7)]
     assert own.config == OwnConfig()
+
+
+@dataclass(frozen=True)
+class ViewConfig:
+    view: int | None = None
+
+
+def test_a_network_that_always_drops_visited_cities_has_the_default_view():
+    seen = []
+
+    class Near(nn.Module):
+        config = ViewConfig()
+
+        def forward(self, cities, agents, visited):
+            seen.append(self.config.view)
+            return -cities.norm(dim=-1)
+
+    near = Near().eval()
+    for n_nodes, options in ((399, {}), (400, {}), (400, {"view": 7})):
+        solve(uniform(np.random.default_rng(0), n_nodes, 3), near, device="cpu", **options)
+    assert list(dict.fromkeys(seen)) == [None, 100, 7]
 
 
 def test_a_network_of_ones_own_plans_from_its_file(tmp_path):

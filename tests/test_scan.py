@@ -7,14 +7,14 @@ from benchmarks import scan
 from benchmarks.__main__ import main
 from benchmarks.suite import Cell
 from dan_policy import solve
-from dan_policy.solution import sample_clip
+from dan_policy.heuristics import sampling_clip
 from mtsp_env import uniform
 
 
 def test_without_a_clip_samples_take_the_one_of_their_size() -> None:
     instance = uniform(np.random.default_rng(0), 30, 3)
     plain = solve(instance, decode="sample", samples=4)
-    assert solve(instance, decode="sample", samples=4, clip=sample_clip(10.0, 30)).tours == plain.tours
+    assert solve(instance, decode="sample", samples=4, clip=sampling_clip(10.0, 30)).tours == plain.tours
     with pytest.raises(ValueError, match=r"clip must be above 0, got 0\.0"):
         solve(instance, decode="sample", clip=0.0)
 

@@ -6,7 +6,6 @@ All on the CPU, as every other solver: times are to be compared.
 from __future__ import annotations
 
 from benchmarks.policies import nearest as simple
-from dan_policy import make_actor
 from dan_policy import solve as play
 from mtsp_env.instance import Instance, Tours
 
@@ -25,7 +24,7 @@ def dan(
     """
     if samples is None:
         return play(instance, policy, augment=augment, device="cpu").tours
-    return play(instance, policy, "sample", samples, seed, device="cpu", augment=augment).tours
+    return play(instance, policy, decode="sample", samples=samples, seed=seed, device="cpu", augment=augment).tours
 
 
 def improved_dan(instance: Instance, seconds: float, seed: int, policy: str = "default") -> Tours:
@@ -35,9 +34,9 @@ def improved_dan(instance: Instance, seconds: float, seed: int, policy: str = "d
 
 def nearest(instance: Instance, seconds: float, seed: int) -> Tours:
     """Each agent goes to the nearest unvisited city. Ignores ``seconds``."""
-    return play(instance, make_actor(simple.nearest), device="cpu").tours
+    return play(instance, simple.nearest, device="cpu").tours
 
 
 def uniformly_random(instance: Instance, seconds: float, seed: int) -> Tours:
     """One game of uniformly random legal actions. Ignores ``seconds``."""
-    return play(instance, make_actor(simple.uniformly_random), "sample", 1, seed, device="cpu").tours
+    return play(instance, simple.uniformly_random, decode="sample", samples=1, seed=seed, device="cpu").tours
