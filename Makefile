@@ -1,33 +1,49 @@
-# Everything a fresh machine needs is Python 3.10 or newer and make.
+# A fresh machine needs Python 3.10 or newer and make; everything else goes into .venv.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-STAMP := $(VENV)/.installed
+PIP := $(BIN)/python -m pip
+INSTALL := $(PIP) install --quiet --constraint constraints.txt
 
-.PHONY: demo test lint wheel clean
+.PHONY: demo test test-fast coverage lint types wheel clean
 
-# The tours of the examples, planned by the shipped DAN; prints where the picture is.
-demo: $(STAMP)
+# Plans the tours of the examples with the shipped network and says where the pictures are.
+demo: $(VENV)/.demo
 	$(BIN)/mtsp solve examples/*.tsp --agents 4 --plot tours.png
 
-# The environment and the whole test suite.
-test: $(STAMP)
+# The whole test suite.
+test: $(VENV)/.dev
 	$(BIN)/python -m pytest
 
-lint: $(STAMP)
+# The quick tests alone, on all cores: less than a minute.
+test-fast: $(VENV)/.dev
+	$(BIN)/python -m pytest -m "not slow and not gpu" --numprocesses auto
+
+# The whole test suite; lists the lines of mtsp_env and dan_policy that no test runs, and fails if more than 5 % are missed.
+coverage: $(VENV)/.dev
+	$(BIN)/python -m pytest --cov --cov-report=term
+
+lint: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-wheel: $(STAMP)
+types: $(VENV)/.dev
+	$(BIN)/mypy
+
+wheel: $(VENV)/.dev
 	$(BIN)/python -m build --wheel
 
-# torch first and alone: on Linux without a GPU its exact pin may be a CPU build, which later requirements must find.
-$(STAMP): pyproject.toml constraints.txt
+# torch goes first and alone: pip then takes a CPU build if it finds one, and the packages after it accept that build.
+$(VENV)/.demo: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[test]"
+	$(PIP) install --quiet --upgrade pip
+	$(INSTALL) torch
+	$(INSTALL) --editable ".[dan,render]"
+	touch $@
+
+$(VENV)/.dev: $(VENV)/.demo
+	$(INSTALL) --editable ".[all]" --group dev
 	touch $@
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info
+	rm -rf $(VENV) build dist *.egg-info .coverage .coverage.* .mypy_cache .nox .pytest_cache .ruff_cache

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -18,9 +19,10 @@ except ImportError as error:
     raise ImportError('mtsp_env.batched needs TorchRL: pip install "mtsp-env[dan]"') from error
 
 from mtsp_env import rules
+from mtsp_env.arrays import library
 from mtsp_env.checks import check_count
 from mtsp_env.distributions import Generator, check_distribution, sample
-from mtsp_env.instance import FIELDS, ArrayField, Problem, Tours, check_arrays
+from mtsp_env.instance import FIELDS, Array, ArrayField, Problem, Tours, check_arrays
 
 Arrays = dict[str, "torch.Tensor"]
 
@@ -39,8 +41,9 @@ class BatchedMTSP(EnvBase):
       stepped from.
 
     ``reset(TensorDict({"game": {"nodes": nodes}}, [B]), set_state=True)`` replays given instances; with all fields of
-    the state under ``"game"``, the games go on from there. Without ``set_state`` a TensorDict's state is ignored: every
-    row, or with ``_reset`` the rows that it asks for, gets a fresh instance. A finished row that is stepped again
+    the state under ``"game"``, the games go on from there. With ``set_state=False`` a TensorDict's state is ignored:
+    every row, or with ``_reset`` the rows that it asks for, gets a fresh instance. If ``set_state`` is not given,
+    TorchRL 0.14 takes it for True and warns; later versions take it for False. A finished row that is stepped again
     repeats its last reward and ``done``.
 
     ``td = env.step(td)["next"]`` is the quickest loop: what ``step`` returns under ``"next"`` can be stepped as it is.
@@ -129,7 +132,7 @@ class BatchedMTSP(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         self._rng = np.random.default_rng(seed)
 
-    def compile(self, **options: object) -> BatchedMTSP:
+    def compile(self, **options: Any) -> BatchedMTSP:
         """Run the rules through ``torch.compile`` from now on; returns this environment.
 
         The first step takes some seconds, longer still if nothing was compiled on this machine before. If compiling
@@ -158,25 +161,28 @@ class BatchedMTSP(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, set_state: bool = False, **_: object) -> TensorDictBase:
         asked = None if tensordict is None else tensordict.get("_reset", None)
         given = set_state and asked is None  # otherwise fresh instances; TorchRL keeps the rows that _reset leaves out
-        arrays = self._given_arrays(tensordict) if given else {"nodes": self._fresh_nodes(asked)}
+        arrays = self._library(self._given_arrays(tensordict) if given else self._fresh_arrays(asked))
         if rules.STATE_FIELDS.keys() <= arrays.keys():
-            state = rules.state_from_arrays(self._library(arrays), self.n_agents)
+            state = rules.state_from_arrays(arrays, self.n_agents)
         else:
-            state = rules.start(Problem(self.n_agents, self._library({"nodes": arrays["nodes"]})))
+            state = rules.start(Problem(self.n_agents, {name: arrays[name] for name in FIELDS if name in arrays}))
         return self._tensordict(self._outputs(state))
 
-    def _fresh_nodes(self, asked: torch.Tensor | None) -> torch.Tensor:
+    def _fresh_arrays(self, asked: torch.Tensor | None) -> Arrays:
         batch = self.batch_size[0]
         rows = torch.ones(batch, dtype=torch.bool) if asked is None else asked.reshape(batch).cpu()
-        nodes = torch.zeros((batch, self.n_nodes, 2), dtype=torch.float64)
         drawn = sample(self.distribution, self._rng, int(rows.sum()), self.n_nodes, self.n_agents)
-        nodes[rows] = torch.as_tensor(drawn.nodes)
-        return nodes.to(self.device)
+        arrays = {}
+        for name, array in drawn.arrays.items():
+            arrays[name] = torch.zeros((batch, *array.shape[1:]), dtype=torch.float64)
+            arrays[name][rows] = torch.as_tensor(array)
+            arrays[name] = arrays[name].to(self.device)
+        return arrays
 
     def _given_arrays(self, tensordict: TensorDictBase | None) -> Arrays:
         game = None if tensordict is None else tensordict.get("game", None)
         nodes = None if game is None else game.get("nodes", None)
-        if nodes is None:
+        if game is None or nodes is None:
             keys = [] if tensordict is None else sorted(map(str, tensordict.keys(True, True)))
             raise ValueError(f"set_state=True needs the key ('game', 'nodes'), got {keys}")
         shape = (*self.batch_size, self.n_nodes, 2)
@@ -214,13 +220,13 @@ class BatchedMTSP(EnvBase):
         after = rules.depart(before, self.rules, arrays["action"])
         return self._outputs(after, rules.reward(before, after, self.rules))
 
-    def _outputs(self, state: rules.State, reward: rules.Array | None = None) -> tuple[dict, dict]:
+    def _outputs(self, state: rules.State, reward: Array | None = None) -> tuple[dict, dict]:
         """Arrays at the root and arrays of the game."""
         terminated, truncated = rules.all_visited(state), rules.truncated(state, self.rules)
         over = {"done": terminated | truncated, "terminated": terminated, "truncated": truncated}
         root = {**rules.observe(state, self.rules)._asdict(), **{key: flag[:, None] for key, flag in over.items()}}
         if reward is not None:
-            xp, _ = rules.library(reward)
+            xp, _ = library(reward)
             root["reward"] = xp.astype(reward, xp.float32)[:, None]
         return root, state.arrays()
 
@@ -292,11 +298,11 @@ class BatchedMTSP(EnvBase):
 
 
 def random_legal_action(action_mask: torch.Tensor, generator: torch.Generator | None = None) -> torch.Tensor:
-    """(B,) int64: a uniformly random legal node of each row of ``action_mask`` (B, n) bool."""
-    rank = action_mask.cumsum(1, dtype=torch.int32)  # (B, n) a legal node's is one above that of the legal one before
-    uniform = torch.rand(action_mask.shape[0], 1, device=action_mask.device, generator=generator)
-    drawn = uniform * rank[:, -1:]  # (B, 1) in [0, number of legal nodes)
-    return torch.searchsorted(rank, drawn.to(torch.int32), right=True)[:, 0]
+    """(...) int64: a uniformly random legal node of each row of ``action_mask`` (..., n) bool."""
+    rank = action_mask.cumsum(-1, dtype=torch.int32)  # (..., n) a legal node's is 1 above that of the legal one before
+    uniform = torch.rand(*rank.shape[:-1], 1, device=rank.device, generator=generator)
+    drawn = uniform * rank[..., -1:]  # (..., 1) in [0, number of legal nodes)
+    return torch.searchsorted(rank, drawn.to(torch.int32), right=True)[..., 0]
 
 
 def masked_random_policy() -> TensorDictModule:

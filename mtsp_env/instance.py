@@ -59,7 +59,7 @@ class ArrayField:
 
 def _array_field(default: object, *description: Any, **limits: Any) -> Any:
     array = ArrayField("float64", *description, **limits)
-    options = {} if default is ... else {"default": default}
+    options: dict[str, Any] = {} if default is ... else {"default": default}
     return field(**options, metadata={"array": array})
 
 
@@ -91,7 +91,7 @@ class Instance:
     """
 
     nodes: np.ndarray = _array_field(..., ("n", 2), "coordinates in the unit square; row 0 is the depot", 0.0, high=1.0)
-    n_agents: int
+    n_agents: int  # type: ignore[misc]  # mypy takes the call above for a default value
     name: str = ""
     scale: float = 1.0
     speeds: np.ndarray | None = _array_field(None, ("m",), "speed relative to 1", 0.0, False)
@@ -286,7 +286,7 @@ def _as_numbers(name: str, values: object) -> np.ndarray:
         raise ValueError(f"{name} must be an array of numbers, got {type(values).__name__}: {error}") from error
 
 
-def _check_scale(scale: float) -> float:
+def _check_scale(scale: Any) -> float:
     try:
         value = float(scale)
     except (TypeError, ValueError, OverflowError):

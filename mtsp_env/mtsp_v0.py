@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from functools import lru_cache
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
@@ -15,6 +15,9 @@ from mtsp_env import rules
 from mtsp_env.distributions import Generator, check_distribution, distribution_name, sample
 from mtsp_env.instance import Instance, Tours, batch
 from mtsp_env.tours import makespan
+
+if TYPE_CHECKING:
+    from mtsp_env.render import Viewer
 
 
 def env(**kwargs: Any) -> AECEnv:
@@ -121,7 +124,7 @@ class raw_env(AECEnv):
         self.state_space = spaces.Box(0.0, np.float32(3e38), (3 * n_nodes + 4 * n_agents,), np.float32)
         self._rng = np.random.default_rng()
         self._legal: np.ndarray | None = None  # (n,) the deciding agent's mask, once it is known
-        self._viewer = None
+        self._viewer: Viewer | None = None
         self.agents: list[str] = []
 
     @property
@@ -174,7 +177,7 @@ class raw_env(AECEnv):
         self._cumulative_rewards = dict.fromkeys(self.agents, 0.0)
         self.terminations = dict.fromkeys(self.agents, False)
         self.truncations = dict.fromkeys(self.agents, False)
-        self.infos = {a: {} for a in self.agents}
+        self.infos: dict[str, dict[str, Any]] = {a: {} for a in self.agents}
         if self.render_mode == "human":
             self.render()
 
@@ -306,7 +309,7 @@ def _observation_space(n_nodes: int, n_agents: int) -> spaces.Dict:
                 {
                     "cities": spaces.Box(-1.0, 1.0, (n_nodes, 2), np.float32),
                     "agents": spaces.Box(low, high, dtype=np.float32),
-                    "visited": spaces.Box(0, 1, (n_nodes,), np.bool_),
+                    "visited": spaces.Box(0, 1, (n_nodes,), np.bool_),  # type: ignore[arg-type]  # not in its types
                     "agent": spaces.Discrete(n_agents),
                 }
             ),

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mtsp_env.files import atomic_write
 from mtsp_env.instance import Instance
 from mtsp_env.tours import path_lengths
 
@@ -57,17 +58,13 @@ def save_picture(
         OSError: the file cannot be written.
         ValueError: an unknown suffix, or tours that ``draw_tours`` refuses.
     """
-    path = Path(path)
     suffix = check_suffix(path)
-    ax = draw_tours(instance, tours)
+    figure = _new_figure(_fitting_size(instance))
+    ax = draw_tours(instance, tours, figure.subplots())
     if title is not None:
         ax.set_title(title, parse_math=False)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        ax.figure.savefig(temporary, format=suffix, dpi=150, bbox_inches="tight")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, format=suffix, dpi=150, bbox_inches="tight")
 
 
 def check_suffix(path: str | os.PathLike) -> str:
@@ -109,7 +106,7 @@ class Viewer:
             ValueError: tours that ``draw_tours`` refuses.
         """
         _check_drawable(instance, tours)
-        if self._figure is None or self._was_closed_by_hand():
+        if self._figure is None or (self.show and not _is_open(self._figure)):
             self._figure = _new_window() if self.show else _new_figure((8.0, 6.0))
             self._instance = None
         if self._instance is not instance:
@@ -123,6 +120,9 @@ class Viewer:
             canvas.draw_idle()
             canvas.flush_events()
             return None
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+        assert isinstance(canvas, FigureCanvasAgg)  # of _new_figure
         canvas.draw()
         return np.array(np.asarray(canvas.buffer_rgba())[:, :, :3])  # a copy: the canvas draws into its own again
 
@@ -133,13 +133,6 @@ class Viewer:
 
             pyplot.close(self._figure)
         self._figure = self._instance = None
-
-    def _was_closed_by_hand(self) -> bool:
-        if not self.show:
-            return False
-        from matplotlib import pyplot
-
-        return not pyplot.fignum_exists(self._figure.number)
 
 
 class _Picture:
@@ -154,16 +147,21 @@ class _Picture:
         styles = ["-" if agent < len(COLOURS) else "--" for agent in range(m)]
         self.lines = [ax.plot([], [], style, color=c)[0] for style, c in zip(styles, self.colours, strict=True)]
         size = float(np.clip(4000 / n, 10, 45))  # points^2
-        self.cities = ax.scatter(*nodes[1:].T, s=size, linewidths=0.9, zorder=3)
+        self.cities = ax.scatter(nodes[1:, 0], nodes[1:, 1], s=size, linewidths=0.9, zorder=3)
         self.heads = ax.scatter([], [], s=4 * size + 40, facecolors="none", linewidths=2.0, zorder=4)
         ax.plot(*nodes[0], "s", color="black", markeredgecolor="white", markersize=11, zorder=5)
 
         rows = self.lines[:LEGEND_ROWS]
         self.legend = ax.legend(
-            rows, [" "] * len(rows), loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=9
+            rows,
+            [" "] * len(rows),
+            title=f"the {len(rows)} longest of {m} tours" if m > len(rows) else None,
+            title_fontsize=9,
+            fontsize=9,
+            loc="upper left",
+            bbox_to_anchor=(1.0, 1.0),
+            frameon=False,
         )
-        if m > len(rows):
-            self.legend.set_title(f"the {len(rows)} longest of {m} tours", prop={"size": 9})
         margin = 0.03 * (np.ptp(nodes, axis=0).max() or 1.0)
         ax.set_xlim(nodes[:, 0].min() - margin, nodes[:, 0].max() + margin)
         ax.set_ylim(nodes[:, 1].min() - margin, nodes[:, 1].max() + margin)
@@ -182,14 +180,16 @@ class _Picture:
             owner[list(tour)] = agent
         owner = owner[1:]
         visited = owner[:, None] >= 0
-        self.cities.set_facecolors(np.where(visited, self.colours[owner], _rgba("white")))
-        self.cities.set_edgecolors(np.where(visited, _rgba("white"), _rgba(UNVISITED)))
+        self.cities.set(
+            facecolor=np.where(visited, self.colours[owner], _rgba("white")),
+            edgecolor=np.where(visited, _rgba("white"), _rgba(UNVISITED)),
+        )
 
         open_tours = [agent for agent, tour in enumerate(tours) if tour[-1] != 0]
-        self.heads.set_offsets(nodes[[tours[agent][-1] for agent in open_tours]])
-        self.heads.set_edgecolors(self.colours[open_tours])
+        heads = nodes[[tours[agent][-1] for agent in open_tours]]
+        self.heads.set(offsets=heads, edgecolor=self.colours[open_tours])
 
-        written = format_lengths(lengths)
+        written = format_lengths(lengths.tolist())
         self._write_legend(lengths, written, longest)
         title = self._title(written[longest or 0], int(visited.sum()), bool(open_tours))
         self.ax.set_title(title, parse_math=False)
@@ -258,10 +258,18 @@ def _new_window() -> Figure:
     except ImportError as error:
         raise _missing() from error
     figure = pyplot.figure(figsize=(8.0, 6.0))
-    figure.canvas.manager.set_window_title("mTSP")
-    with contextlib.suppress(NonGuiException):  # Figure.show would warn where the backend has no windows
-        figure.canvas.manager.show()
+    window = figure.canvas.manager
+    if window is not None:
+        window.set_window_title("mTSP")
+        with contextlib.suppress(NonGuiException):  # a backend without windows
+            window.show()
     return figure
+
+
+def _is_open(window: Figure) -> bool:
+    from matplotlib import pyplot
+
+    return pyplot.fignum_exists(window.number)
 
 
 def _missing() -> ImportError:

@@ -134,7 +134,7 @@ def start(problem: Problem) -> State:
     if n_nodes * n_agents >= 2**30:
         raise ValueError(f"n_nodes * n_agents must be below 2^30, got {n_nodes} * {n_agents}")
 
-    def zeros(*shape, dtype=xp.int64):
+    def zeros(*shape: int, dtype: object = xp.int64) -> Array:
         return xp.zeros(shape, dtype=dtype, device=on)
 
     home = norm(nodes - nodes[:, :1])

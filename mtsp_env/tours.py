@@ -43,15 +43,15 @@ def check_tours(instance: Instance, tours: Sequence[Sequence[int]]) -> None:
         raise ValueError(f"expected {instance.n_agents} tours, one per agent, got {len(tours)}")
     count = np.zeros(instance.n_nodes, dtype=np.int64)
     for agent, tour in enumerate(tours):
-        tour = np.asarray(tour)
-        if tour.ndim != 1 or not np.issubdtype(tour.dtype, np.integer) or len(tour) < 2:
-            raise ValueError(f"tour {agent} must be a list of at least 2 node numbers, got {tour.tolist()}")
-        outside = tour[(tour < 0) | (tour >= instance.n_nodes)]
+        path = np.asarray(tour)
+        if path.ndim != 1 or not np.issubdtype(path.dtype, np.integer) or len(path) < 2:
+            raise ValueError(f"tour {agent} must be a list of at least 2 node numbers, got {path.tolist()}")
+        outside = path[(path < 0) | (path >= instance.n_nodes)]
         if len(outside):
             raise ValueError(f"tour {agent} visits node {outside[0]}, outside 0..{instance.n_nodes - 1}")
-        if tour[0] != 0 or tour[-1] != 0:
-            raise ValueError(f"tour {agent} must begin and end at the depot 0, got {tour[0]} and {tour[-1]}")
-        count += np.bincount(tour, minlength=instance.n_nodes)
+        if path[0] != 0 or path[-1] != 0:
+            raise ValueError(f"tour {agent} must begin and end at the depot 0, got {path[0]} and {path[-1]}")
+        count += np.bincount(path, minlength=instance.n_nodes)
     missing = np.flatnonzero(count[1:] == 0) + 1
     if len(missing):
         raise ValueError(f"{_cities(missing)} missing from the tours")
@@ -69,11 +69,11 @@ def check_prefixes(instance: Instance, prefixes: Sequence[Sequence[int]]) -> Tou
     Raises:
         ValueError: no tours that solve the instance begin like this.
     """
-    prefixes = [[int(node) for node in prefix] for prefix in prefixes]
     if len(prefixes) != instance.n_agents:
         raise ValueError(f"expected {instance.n_agents} prefixes, one per agent, got {len(prefixes)}")
+    lists = [[int(node) for node in prefix] for prefix in prefixes]
     seen: set[int] = set()
-    for agent, prefix in enumerate(prefixes):
+    for agent, prefix in enumerate(lists):
         if not prefix or prefix[0] != 0:
             raise ValueError(f"prefix {agent} must begin at the depot 0, got {prefix}")
         for node in prefix:
@@ -84,9 +84,9 @@ def check_prefixes(instance: Instance, prefixes: Sequence[Sequence[int]]) -> Tou
             seen.add(node)
         if 0 in prefix[1:-1]:
             raise ValueError(f"prefix {agent} must not pass the depot in between, got {prefix}")
-    if len(seen) < instance.n_nodes and all(map(is_closed, prefixes)):
+    if len(seen) < instance.n_nodes and all(map(is_closed, lists)):
         raise ValueError(f"all agents are home for good, and {instance.n_nodes - len(seen)} cities are left")
-    return prefixes
+    return lists
 
 
 def is_closed(prefix: Sequence[int]) -> bool:

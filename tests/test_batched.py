@@ -1,13 +1,19 @@
 """The TorchRL face: specs, resets, replay, seeds, and the same games whatever the batch."""
 
+import warnings
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
+from scipy.stats import chisquare
 from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.envs import ParallelEnv, SerialEnv
 from torchrl.envs.utils import check_env_specs, step_mdp
 
 from mtsp_env import Instance, check_tours, lower_bound, makespan, rules
-from mtsp_env.batched import BatchedMTSP
+from mtsp_env.batched import BatchedMTSP, masked_random_policy, random_legal_action
 
 GAME = [("game", key) for key in ("nodes", *rules.STATE_FIELDS)]
 DEVICES = [
@@ -212,3 +218,126 @@ def test_truncation_pays_the_trips_to_every_city_left():
     trips = 2 * (nodes - nodes[:, :1]).norm(dim=2) * ~td["visited"]
     so_far = torch.tensor([makespan(Instance(x.numpy(), 3), t) for x, t in zip(nodes, env.tours(td), strict=True)])
     assert torch.allclose(-td["reward"][:, 0].double(), so_far + trips.sum(1), rtol=1e-6)
+
+
+# What TorchRL's own tools need
+
+
+def test_a_batch_size_may_be_a_number():
+    assert BatchedMTSP(9, 3, 4).batch_size == torch.Size([4])
+    with pytest.raises(ValueError, match=r"batch_size must be B or \[B\], got \[2, 3\]"):
+        BatchedMTSP(9, 3, [2, 3])
+
+
+def test_actions_of_any_whole_number_type_and_layout_are_taken():
+    env = make()
+    td = env.reset()
+    action = random_legal_action(td["action_mask"])
+    expected = env.step(td.clone().set("action", action))["next"]
+    for same in (action.to(torch.int32), action.to(torch.uint8), torch.stack([action, action], 1)[:, 0]):
+        after = env.step(td.clone().set("action", same))["next"]
+        assert all(torch.equal(after[key], expected[key]) for key in [*GAME, "cities", "agents", "action_mask"])
+    for wrong in (action.float(), action > 0, action[:, None], action[:3]):
+        with pytest.raises(ValueError, match=r"action must be whole numbers of shape \(6,\), got"):
+            env._step(TensorDict({"action": wrong, "game": td["game"]}))
+
+
+def test_a_reset_takes_the_state_that_it_is_given_if_set_state_says_so():
+    env, other = make(seed=3), make(seed=3)
+    given = env.reset()
+    other.reset()
+    assert torch.equal(env.reset(given, set_state=False)["game", "nodes"], other.reset()["game", "nodes"])
+    assert torch.equal(env.reset(given, set_state=True)["game", "nodes"], given["game", "nodes"])
+    with pytest.warns(FutureWarning, match="set_state"):  # TorchRL's own default changes
+        env.reset(given)
+
+
+def test_a_step_changes_nothing_that_came_before():
+    env = make(depot="final")
+    td = env.rand_action(env.reset())
+    kept = td.clone()
+    env.step(td)
+    assert all(torch.equal(td[key], kept[key]) for key in kept.keys(True, True))
+
+
+@pytest.mark.parametrize("kind", [SerialEnv, ParallelEnv])
+def test_the_masked_random_policy_plays_in_environments_of_workers(kind):
+    """Each worker's games, and their seeds, are its own; nobody takes an illegal action."""
+    env = kind(2, partial(BatchedMTSP, 7, 2, 3, depot="final"))
+    try:
+        env.set_seed(5)
+        torch.manual_seed(0)
+        data = env.rollout(20, masked_random_policy(), break_when_any_done=False, auto_reset=True)
+        taken = data["action_mask"].gather(-1, data["action"][..., None])
+        assert taken.all() and data["next", "done"].any()
+        nodes = data["game", "nodes"][:, :, 0]  # (2, 3, n, 2)
+        assert not torch.equal(nodes[0], nodes[1])
+        env.set_seed(5)
+        assert torch.equal(env.reset()["game", "nodes"], nodes)
+    finally:
+        env.close()
+
+
+def test_the_masked_random_policy_feeds_a_collector():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        collector = Collector(make(depot="final"), masked_random_policy(), frames_per_batch=60, total_frames=120)
+    for batch in collector:
+        assert batch["action_mask"].gather(-1, batch["action"][..., None]).all()
+    collector.shutdown()
+
+
+def test_random_legal_actions_are_uniform():
+    mask = torch.tensor([True, False, True, True, False]).expand(30_000, -1)
+    counts = torch.bincount(random_legal_action(mask, torch.Generator().manual_seed(0)), minlength=5)
+    assert counts[[1, 4]].sum() == 0 and chisquare(counts[[0, 2, 3]].numpy()).pvalue > 1e-3
+
+
+# Compiled, or from one's own distribution
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("depot", ["open", "final"])
+def test_compiled_rules_play_the_same_games(depot):
+    compiled, eager = make(depot=depot, compile=True), make(depot=depot)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", "torch.compile failed")
+        steps, last = play(eager, eager.reset())
+        td = compiled.reset()
+        for step in steps:
+            for key in [*GAME, "cities", "agents", "visited", "action_mask", "agent", "done"]:
+                torch.testing.assert_close(td[key], step[key], rtol=0, atol=1e-12 if key in GAME else 1e-6)
+            td = compiled.step(td.set("action", step["action"]))["next"]
+    torch.testing.assert_close(td["reward"], last["reward"])
+
+
+def test_rules_that_cannot_be_compiled_run_as_they_are(monkeypatch):
+    def broken(function, **options):
+        def fails(*args):
+            raise RuntimeError("no compiler\nin sight")
+
+        return fails
+
+    monkeypatch.setattr(torch, "compile", broken)
+    env, plain = make(compile=True), make()
+    td, expected = env.reset(), plain.reset()
+    action = random_legal_action(td["action_mask"])
+    with pytest.warns(UserWarning, match="torch.compile failed, the rules run without it: RuntimeError: no compiler"):
+        td = env.step(td.set("action", action))["next"]
+    assert torch.equal(td["cities"], plain.step(expected.set("action", action))["next", "cities"])
+
+
+def test_a_distribution_of_ones_own():
+    def on_a_line(rng, batch, n_nodes, n_agents):
+        return {"nodes": np.stack([rng.random((batch, n_nodes)), np.full((batch, n_nodes), 1 / n_agents)], axis=2)}
+
+    nodes = make(distribution=on_a_line).reset()["game", "nodes"]
+    assert (nodes[..., 1] == 1 / 3).all() and nodes[..., 0].unique().numel() == 6 * 9
+    with pytest.raises(ValueError, match="a distribution must return a dict of arrays"):
+        make(distribution=lambda *_: np.zeros((6, 9, 2))).reset()
+    with pytest.raises(ValueError, match=r"nodes must have shape \(6, 9, 2\), got \(6, 8, 2\)"):
+        make(distribution=lambda *_: {"nodes": np.zeros((6, 8, 2))}).reset()
+    with pytest.raises(ValueError, match="unknown field 'city'"):
+        make(distribution=lambda *_: {"nodes": np.zeros((6, 9, 2)), "city": np.zeros((6, 9))}).reset()
+    with pytest.raises(ValueError, match=r"only plain problems .* this one has the world fields \['speeds'\]"):
+        make(distribution=lambda *_: {"nodes": np.zeros((6, 9, 2)), "speeds": np.ones((6, 3))}).reset()

@@ -17,13 +17,16 @@ from mtsp_env import (
     Instance,
     clustered,
     from_coordinates,
+    makespan,
     read_instance,
     read_tours,
+    rules,
     uniform,
     write_instance,
     write_tours,
 )
 from mtsp_env.distributions import sample
+from mtsp_env.instance import FIELDS, WORLD_FIELDS, batch
 
 PAIR = [[0.0, 0.0], [1.0, 1.0]]
 HUGE = 10**400  # too large for a float
@@ -294,3 +297,64 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch) -> None:
         write_tours(path, [[0, 1, 0]], what=object())
     assert read_instance(path) == old
     assert list(tmp_path.iterdir()) == [path]
+
+
+# Worlds
+
+
+def a_world(n_nodes: int = 4, n_agents: int = 2) -> dict[str, np.ndarray]:
+    """A value for every world field."""
+    return {
+        "speeds": np.linspace(0.5, 1.5, n_agents),
+        "service": np.arange(n_nodes) / 10,
+        "appears": np.arange(n_nodes) / 5,
+        "breaks": np.array([math.inf, *range(1, n_agents)]),
+        "traffic": np.ones((n_agents, 3)),
+    }
+
+
+def test_the_fields_table_describes_every_array_of_an_instance() -> None:
+    others = {"n_agents", "name", "scale"}
+    assert {each.name for each in dataclasses.fields(Instance)} == others | set(FIELDS)
+    assert set(a_world()) == set(WORLD_FIELDS)
+    assert all(field.meaning and field.dtype == "float64" for field in FIELDS.values())
+
+
+@pytest.mark.parametrize("field", WORLD_FIELDS)
+def test_worlds_are_compared_hashed_pickled_written_and_batched(field: str, tmp_path) -> None:
+    nodes, value = np.random.default_rng(0).random((4, 2)), a_world()[field]
+    plain, world = Instance(nodes, 2), Instance(nodes, 2, **{field: value})
+    assert plain != world and plain == Instance(nodes, 2) and len({plain, world, Instance(nodes, 2)}) == 2
+    copy = pickle.loads(pickle.dumps(world))
+    assert copy == world and not getattr(copy, field).flags.writeable
+    write_instance(tmp_path / "world.json", world)
+    assert read_instance(tmp_path / "world.json") == world
+    problem = batch([world, world])
+    assert problem.arrays[field].shape == (2, *value.shape) and problem.instance(1) == world
+    with pytest.raises(ValueError, match="instance 1 has"):
+        batch([world, plain])
+    for judge in (lambda: rules.start(problem), lambda: makespan(world, [[0, 1, 2, 3, 0], [0, 0]])):
+        with pytest.raises(ValueError, match=rf"only plain problems .* world fields \['{field}'\]"):
+            judge()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"speeds": [1.0, 0.0]}, r"speeds must be above 0, got a range of \[0, 1\]"),
+        ({"speeds": [1.0]}, r"speeds must have shape \(m\) with n=4, m=2, got \(1,\)"),
+        ({"speeds": [1.0, math.inf]}, r"speeds must be finite, got inf at \(1,\)"),
+        ({"service": [0.0, 1.0, -1.0, 0.0]}, r"service must be at least 0, got a range of \[-1, 1\]"),
+        ({"service": [0.5, 1.0, 1.0, 0.0]}, "service must be 0 at the depot, got 0.5"),
+        ({"appears": [0.5, 1.0, 1.0, 0.0]}, "appears must be 0 at the depot, got 0.5"),
+        ({"breaks": [1.0, 2.0]}, "breaks: at least one agent must never break down"),
+        ({"breaks": [0.0, math.inf]}, r"breaks must be above 0, got a range of \[0, inf\]"),
+        ({"breaks": [math.nan, math.inf]}, r"breaks must be numbers, got nan at \(0,\)"),
+        ({"traffic": np.ones((2, 0))}, r"traffic must have shape \(m, K\) with n=4, m=2, got \(2, 0\)"),
+        ({"traffic": -np.ones((2, 1))}, "traffic must be above 0"),
+        ({"service": ["soon"] * 4}, "service must be an array of numbers"),
+    ],
+)
+def test_bad_worlds_are_refused_with_value_and_range(change: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Instance(np.zeros((4, 2)), 2, **change)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 import warnings
+from collections.abc import Callable
 from importlib.util import find_spec
 from itertools import combinations
 
@@ -325,3 +326,61 @@ def check_torchrl_observation(now: object, raw: mtsp_v0.raw_env, acting: int | N
             assert bool(now["mask"][i]) == (i == acting)
         if i == acting:
             assert now["action_mask"][i].tolist() == seen["action_mask"].astype(bool).tolist()
+
+
+# Copies
+
+
+def story_of(env: pettingzoo.AECEnv) -> list[tuple]:
+    """What is seen and paid until the end of the episode and in the next reset, under actions that depend on that."""
+    story = []
+    while not over(env):
+        agent, seen = env.agent_selection, env.observe(env.agent_selection)
+        legal = np.flatnonzero(seen["action_mask"])
+        env.step(int(legal[7 * len(legal) // 10]))
+        story.append((agent, seen, dict(env.rewards), env.unwrapped.tours, dict(env.infos)))
+    env.reset()
+    return [*story, env.unwrapped.instance]
+
+
+@pytest.mark.parametrize(
+    "copy_of", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"]
+)
+@pytest.mark.parametrize("make", [mtsp_v0.env, mtsp_v0.raw_env])
+@pytest.mark.parametrize("reward", ["sparse", "shaped"])
+def test_a_copy_of_a_running_game_goes_on_as_the_game_does(make: Callable, copy_of: Callable, reward: str) -> None:
+    env = make(n_nodes=8, n_agents=3, reward=reward)
+    env.reset(seed=3)
+    story, copies = story_of(copy_of(env)), []
+    for agent, seen, *_ in story[:-1]:
+        copies.append(copy_of(env))
+        assert env.agent_selection == agent and same(env.observe(agent), seen)
+        legal = np.flatnonzero(seen["action_mask"])
+        env.step(int(legal[7 * len(legal) // 10]))
+    assert over(env) and len(copies) >= 7
+    for passed, twin in enumerate(copies):
+        assert same(story_of(twin), story[passed:])  # no copy has changed another
+
+
+def test_agents_are_counted_before_the_first_reset() -> None:
+    for env in (mtsp_v0.env(n_agents=4), mtsp_v0.raw_env(n_agents=4)):
+        assert env.num_agents == env.max_num_agents == 4
+
+
+def test_tours_are_in_the_infos_on_request() -> None:
+    for info_tours in (False, True):
+        env = mtsp_v0.env(n_nodes=6, n_agents=2, info_tours=info_tours)
+        env.reset(seed=0)
+        play(env)
+        info = env.infos["agent_0"]
+        assert info.get("tours", env.unwrapped.tours) == env.unwrapped.tours
+        assert set(info) == {"makespan", "tours"} if info_tours else {"makespan"}
+
+
+def test_a_distribution_of_ones_own() -> None:
+    def square(rng: np.random.Generator, batch: int, n_nodes: int, n_agents: int) -> dict:
+        return {"nodes": np.tile([[0.0, 0.0], [0.0, 1.0], [1.0, 1.0], [1.0, 0.0]], (batch, 1, 1))}
+
+    env = mtsp_v0.env(n_nodes=4, n_agents=2, distribution=square)
+    env.reset(seed=0)
+    assert env.unwrapped.instance.nodes[2].tolist() == [1.0, 1.0] and env.unwrapped.instance.name == "square"

@@ -308,7 +308,7 @@ def test_lengths_are_kept_as_the_judge_finds_them(n: int, m: int, hot: float, we
         tours = search_arrays.as_tours(sisr.best_order(now), m)
         check_tours(instance, tours)
         assert search.length == pytest.approx(tour_lengths(instance, tours), abs=1e-10)
-        assert search.count.tolist() == [len(tour) - 2 for tour in tours]
+        assert search.n_movable.tolist() == [len(tour) - 2 for tour in tours]
         assert (search.previous[search.next] == np.arange(n + m)).all()
         if hot < 1e-6:
             before, objective = objective, search.length.max() + sisr.TOTAL_WEIGHT * search.length.sum()

@@ -94,7 +94,7 @@ def test_a_network_of_ones_own_is_trained_saved_and_continued(tmp_path):
     assert isinstance(learner.network, AttentionModel)
     again = ReinforceLearner(replace(TINY, policy=policy, init=str(tmp_path / "last.safetensors")))
     assert same(dict(again.network.state_dict()), dict(learner.network.state_dict()))
-    with pytest.raises(ValueError, match="names the factory 'benchmarks.policies.attention_model:AttentionModel'"):
+    with pytest.raises(ValueError, match="names the factory 'benchmarks"):
         ReinforceLearner(replace(TINY, init=str(tmp_path / "last.safetensors")))
     with pytest.raises(ValueError, match=r"package.module:factory, got 'nothing.here:at_all'"):
         ReinforceLearner(replace(TINY, policy="nothing.here:at_all"))

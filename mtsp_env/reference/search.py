@@ -29,7 +29,7 @@ def new_search(nodes: np.ndarray, n_agents: int, seed: int) -> sisr.Search:
         leg=np.zeros(size),
         tour=np.maximum(itself - n, -1),
         length=np.zeros(n_agents),
-        count=np.zeros(n_agents, np.int32),
+        n_movable=np.zeros(n_agents, np.int32),
         head=np.zeros(n_agents, np.int32),
         driven=np.zeros(n_agents),
         ruined=np.zeros(n_agents, np.int64),

@@ -49,7 +49,7 @@ class Search(NamedTuple):
     leg: np.ndarray  # (N,) float64, distance from the previous node
     tour: np.ndarray  # (N,) int32, the agent; -1: on no tour
     length: np.ndarray  # (m,) float64, of each tour
-    count: np.ndarray  # (m,) int32, cities on each tour that may be moved: all but the head
+    n_movable: np.ndarray  # (m,) int32, cities on each tour that may be moved: all but the head
     head: np.ndarray  # (m,) int32, the tour's first city where it must stay so; the agent's depot: closed; 0: free
     driven: np.ndarray  # (m,) float64, length of the tour as far as the head
     ruined: np.ndarray  # (m,) int64, the iteration that last took a string from the tour
@@ -106,7 +106,7 @@ def insert_greedily(search: Search, order: np.ndarray) -> None:
 def load_tours(search: Search, order: np.ndarray) -> None:
     """Make the tours anew from ``order`` (n - 1 + m,): the cities of each tour, its head first, and then a 0."""
     depot = search.tour.shape[0] - search.length.shape[0]
-    search.count[:] = 0
+    search.n_movable[:] = 0
     for node in range(depot, search.tour.shape[0]):
         search.previous[node] = search.next[node] = node
     home = depot
@@ -117,7 +117,7 @@ def load_tours(search: Search, order: np.ndarray) -> None:
             _link(search, node, search.previous[home])
     for agent in range(search.head.shape[0]):
         if 0 < search.head[agent] < depot:
-            search.count[agent] -= 1
+            search.n_movable[agent] -= 1
     search.best[:] = search.next
 
 
@@ -198,7 +198,7 @@ def anneal(
 
 
 @njit(cache=True, inline="always")
-def _ruin(search, iteration, makespan):
+def _ruin(search: Search, iteration: int, makespan: float) -> tuple[int, float]:
     """Remove strings of cities around a random city; how many cities, and how much the total length shrinks."""
     n_agents = search.length.shape[0]
     n_cities = search.tour.shape[0] - n_agents - 1
@@ -227,10 +227,10 @@ def _ruin(search, iteration, makespan):
 
 
 @njit(cache=True, inline="always")
-def _remove_string(search, n_removed, city, agent, max_string):
+def _remove_string(search: Search, n_removed: int, city: int, agent: int, max_string: float) -> int:
     """Remove a string of ``agent``'s tour around ``city``, or both ends of a longer one; n_removed from then on."""
     depot = search.tour.shape[0] - search.length.shape[0]
-    count = search.count[agent]
+    count = search.n_movable[agent]
     n_remove = int(_random(search) * min(float(count), max_string) + 1.0)
     n_leave = 0
     if 1 < n_remove < count and _random(search) < SPLIT_CHANCE:
@@ -266,7 +266,7 @@ def _remove_string(search, n_removed, city, agent, max_string):
 
 
 @njit(cache=True, inline="always")
-def _sort(search, n_removed):
+def _sort(search: Search, n_removed: int) -> None:
     """The order in which cities go back: random, farthest from the depot first, or nearest first (4 : 2 : 1)."""
     depot = search.tour.shape[0] - 1
     rule = _random(search) * 7.0
@@ -285,7 +285,7 @@ def _sort(search, n_removed):
 
 
 @njit(cache=True, inline="always")
-def _recreate(search, n_removed, makespan, limit):
+def _recreate(search: Search, n_removed: int, makespan: float, limit: float) -> tuple[int, float, float]:
     """Put the removed cities back, each at its cheapest place, until the makespan plus the weighted growth of the total
     length is at least ``limit``: it never falls again. How many are back, that growth, and that makespan."""
     balance = _random(search) < BALANCE_CHANCE
@@ -305,7 +305,7 @@ def _recreate(search, n_removed, makespan, limit):
 
 
 @njit(cache=True, inline="always")
-def _cheapest_place(search, city, makespan, balance):
+def _cheapest_place(search: Search, city: int, makespan: float, balance: bool) -> tuple[int, float]:
     """The node after which ``city`` goes, and by how much its tour grows."""
     depot = search.tour.shape[0] - search.length.shape[0]
     blink = int(_random(search) * BLINK)
@@ -322,7 +322,15 @@ def _cheapest_place(search, city, makespan, balance):
 
 
 @njit(cache=True, inline="always")
-def _cheaper(search, city, node, to_node, makespan, balance, found):
+def _cheaper(
+    search: Search,
+    city: int,
+    node: int,
+    to_node: float,
+    makespan: float,
+    balance: bool,
+    found: tuple[float, int, float],
+) -> tuple[float, int, float]:
     """``found`` (cost, place, growth of the tour), or the place before or after ``node`` where one is cheaper."""
     least, place, place_growth = found
     length = search.length[search.tour[node]]
@@ -343,7 +351,7 @@ def _cheaper(search, city, node, to_node, makespan, balance, found):
 
 
 @njit(cache=True, inline="always")
-def _undo(search, n_removed, n_back):
+def _undo(search: Search, n_removed: int, n_back: int) -> None:
     for i in range(n_back - 1, -1, -1):
         _unlink(search, search.city_log[1, i])
         search.length[search.tour_log[1, i]] = search.length_log[1, i]
@@ -353,7 +361,7 @@ def _undo(search, n_removed, n_back):
 
 
 @njit(cache=True, inline="always")
-def _link(search, city, place):
+def _link(search: Search, city: int, place: int) -> None:
     """Put ``city`` after the node ``place``; the tour's length is the caller's to change."""
     following = search.next[place]
     search.next[place], search.previous[city] = city, place
@@ -361,27 +369,27 @@ def _link(search, city, place):
     search.leg[city] = _distance(search, place, city)
     search.leg[following] = _distance(search, city, following)
     search.tour[city] = search.tour[place]
-    search.count[search.tour[place]] += 1
+    search.n_movable[search.tour[place]] += 1
 
 
 @njit(cache=True, inline="always")
-def _unlink(search, city):
+def _unlink(search: Search, city: int) -> None:
     """Take ``city`` off its tour; the tour's length is the caller's to change."""
     before, following = search.previous[city], search.next[city]
     search.next[before], search.previous[following] = following, before
     search.leg[following] = _distance(search, before, following)
-    search.count[search.tour[city]] -= 1
+    search.n_movable[search.tour[city]] -= 1
     search.tour[city] = -1
 
 
 @njit(cache=True, inline="always")
-def _distance(search, a, b):
+def _distance(search: Search, a: int, b: int) -> float:
     dx, dy = search.x[a] - search.x[b], search.y[a] - search.y[b]
     return sqrt(dx * dx + dy * dy)
 
 
 @njit(cache=True, inline="always")
-def _random(search):
+def _random(search: Search) -> float:
     """Uniform in [0, 1): xorshift64*."""
     z = search.random[0]
     z ^= z >> np.uint64(12)

@@ -70,19 +70,19 @@ def improve(
     if seconds is not None:
         check_seconds("seconds", seconds)
     _check_search(iterations, seed)
-    if prefixes is not None:
-        prefixes = check_prefixes(instance, prefixes)
+    begun = None if prefixes is None else check_prefixes(instance, prefixes)
+    given = None
     if tours is not None:
         check_tours(instance, tours)
-        tours = [[int(node) for node in tour] for tour in tours]
-        for agent, (tour, prefix) in enumerate(zip(tours, prefixes or [], strict=False)):
+        given = [[int(node) for node in tour] for tour in tours]
+        for agent, (tour, prefix) in enumerate(zip(given, begun or [], strict=False)):
             if tour[: len(prefix)] != prefix or (is_closed(prefix) and tour != prefix):
                 raise ValueError(f"tour {agent} must begin with its prefix {prefix}, got {tour}")
     compile_kernels()
-    found = _solve(instance.nodes, instance.n_agents, tours, seconds, iterations, seed, prefixes=prefixes)
-    if tours is not None and makespan(instance, tours) <= makespan(instance, found):
-        return tours
-    return found
+    solution = _solve(instance.nodes, instance.n_agents, given, seconds, iterations, seed, prefixes=begun)
+    if given is not None and makespan(instance, given) <= makespan(instance, solution):
+        return given
+    return solution
 
 
 def improve_batch(
