@@ -12,6 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from dan_policy.actor import make_actor, network_keys
+from dan_policy.joint import DenseLogits
 from dan_policy.registry import find
 from train.buffer import Buffer
 from train.collect import autocast
@@ -104,7 +105,8 @@ def imitation_losses(network: nn.Module, decisions: TensorDictBase) -> Imitation
         decisions: TensorDict [N] of one set.
     """
     if "plan" in decisions.keys():  # noqa: SIM118 (a TensorDict is no mapping)
-        logits = network.forward_dense(*(decisions[key] for key in network_keys(network)))
+        forward_dense: Any = network.forward_dense
+        logits: DenseLogits = forward_dense(*(decisions[key] for key in network_keys(network)))
         log_prob = logits.policy.masked_fill(~decisions["action_mask"], -torch.inf).log_softmax(1)
         log_prob = log_prob.gather(1, decisions["action"][:, None])[:, 0]
         next_loss, assignment_loss = plan_losses(logits, decisions)
