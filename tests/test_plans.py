@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from states import same
+from helpers.states import same
 
 from dan_policy.dan import DAN, DANConfig
 from dan_policy.joint import DenseLogits, JointConfig, JointDAN
