@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from dan_policy import DAN, DANConfig, make_actor
@@ -53,6 +54,7 @@ def one_process(folder):
         checkpoint.write(Path(folder) / str(distributed.rank()), {"grad": gradients, "all": gathered, "votes": votes})
 
 
+@pytest.mark.slow
 def test_two_processes_have_the_gradient_of_one_with_all_their_episodes(tmp_path):
     torchrun(__file__, tmp_path)
     torch.manual_seed(0)
@@ -66,6 +68,7 @@ def test_two_processes_have_the_gradient_of_one_with_all_their_episodes(tmp_path
         assert result["votes"] == (True, False)
 
 
+@pytest.mark.slow
 def test_training_under_torchrun_keeps_the_processes_alike_and_resumes(tmp_path):
     small = ["-m", "train", "reinforce", "quick", "--out", tmp_path, "--n-nodes", 5, 7, "--batch-size", 4,
              "--network.embed-dim", 16, "--challenge-instances", 8, "--challenge-every", 2, "--validation-instances", 4,

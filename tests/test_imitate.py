@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from helpers.states import same
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from states import same
 
 from dan_policy import DAN, DANConfig, load, save
 from dan_policy.episode import rollout
@@ -187,6 +187,7 @@ def test_what_comes_after_the_students_part_is_learnt_from(student):
             assert sorted(steps) == list(range(begin, min(len(valid), begin + count)))
 
 
+@pytest.mark.slow
 def test_workers_make_the_same_sets(student):
     """Set i is the same whether a worker or this process makes it."""
     cities = []
@@ -248,6 +249,7 @@ def test_a_run_does_not_go_on_with_another_student(tmp_path, student):
     assert checkpoint.read(tmp_path / "run" / "checkpoint.pt")["progress"]["step"] == 2
 
 
+@pytest.mark.slow
 def test_imitation_learns_what_the_teacher_does(tmp_path):
     """150 steps at n = 10, m = 2 lower the greedy cost on held-out instances."""
     config = replace(
@@ -282,6 +284,7 @@ def test_bad_configurations_are_named(kwargs, message):
         ImitateConfig(**kwargs)
 
 
+@pytest.mark.slow
 def test_the_command_line_imitates(tmp_path, capsys):
     small = ["--n-nodes", "6", "7", "--n-agents", "1", "2", "--nodes-per-agent", "2", "--set-tokens", "100",
              "--buffer", "4", "--network.embed-dim", "16", "--validation-instances", "4", "--out", str(tmp_path),

@@ -55,6 +55,7 @@ def test_actions_alone_restore_an_episode(network, depot):
     assert (again.decisions[played.valid] == played.decisions[played.valid]).all()
 
 
+@pytest.mark.slow
 def test_workers_play_their_parts_with_the_weights_of_the_moment(network, cluster):
     config = replace(CONFIG, samples=2, baseline="shared", curriculum=((5, 10, 12, 3, 3),))
     workers = RayWorkers(network, config, first_step=3)
@@ -77,6 +78,7 @@ def test_workers_play_their_parts_with_the_weights_of_the_moment(network, cluste
     assert ray.is_initialized()  # not started by the workers
 
 
+@pytest.mark.slow
 def test_a_run_with_workers_continues_bit_for_bit(tmp_path, cluster):
     whole = reinforce(replace(CONFIG, out=tmp_path / "whole", steps=3))
     reinforce(replace(CONFIG, out=tmp_path / "parts", steps=2))

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from states import same
+from helpers.states import same
 from tensordict.nn import TensorDictModule
 from tiny import TINY
 from torch import nn
@@ -252,6 +252,7 @@ def test_the_policy_is_the_running_average_of_the_weights(tmp_path):
     assert not same(dict(kept), dict(averaged.network.state_dict()))
 
 
+@pytest.mark.slow
 def test_training_lowers_the_greedy_cost_on_held_out_instances(tmp_path):
     """200 steps at n = 10, m = 2."""
     config = replace(
