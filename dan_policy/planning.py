@@ -143,6 +143,7 @@ def solve(
     begun = [] if prefixes is None else check_prefixes(instance, prefixes)
     improve = _improvement(options, begun)
     device = find_device(options.device)
+    named = isinstance(policy, (str, os.PathLike))  # a network that is nobody else's
     policy = _placed(_loaded(policy, device), device)
     name, policy = network_name(policy), _configured(policy, options, instance.n_nodes)
     generator = torch.Generator(device).manual_seed(options.seed) if options.decode == "sample" else None
@@ -150,7 +151,7 @@ def solve(
     start = time.perf_counter()
     game = rules.make_rules(instance.n_nodes, instance.n_agents, SPEED, "final", "sparse", None)
     state = begin(instance, game, begun, options.games, options.augment, device)
-    with _autocast(policy, options, instance.n_nodes, device):
+    with torch.inference_mode(named), _autocast(policy, options, instance.n_nodes, device):
         tours = best_tours(play(policy, state, game, generator))
     tours = improve(instance, tours)
     seconds = time.perf_counter() - start
@@ -183,7 +184,12 @@ _load_lock = Lock()  # threads that start together do not all read the same file
 
 @lru_cache(maxsize=4)
 def _read(file: Path, _modified: int, device: torch.device) -> nn.Module:
-    return load(file, device)
+    network = load(file, device)
+    if device.type == "cpu":  # weights stored by columns are faster for the few rows of a single game
+        for layer in network.modules():
+            if isinstance(layer, nn.Linear):
+                layer.weight.data = layer.weight.data.t().contiguous().t()
+    return network
 
 
 def _placed(policy: Any, device: torch.device) -> Any:
