@@ -1,17 +1,14 @@
-"""Files that are whole or not there."""
+"""Text files, written whole."""
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
+from mtsp_env.files import atomic_write
 
-def replace_text(path: Path, text: str) -> None:
-    """Write to a temporary name and move: an older file stays whole until the new one is. Makes the folder."""
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file atomically (``mtsp_env.files.atomic_write``); its folder is made if it is missing."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

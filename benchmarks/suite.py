@@ -1,4 +1,4 @@
-"""Test sets: the instances of the paper's tables, which nothing is ever trained or tuned on."""
+"""Test sets: the instances of the paper's tables. Nothing is trained or tuned on them."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from mtsp_env.distributions import sample
 from mtsp_env.instance import Instance, Tours
 from mtsp_env.tsplib import read_tsplib
 
-SEED = 7  # of the published results
+SEED = 7  # of the test sets
 
 
 @dataclass(frozen=True)
 class Cell:
-    """Uniform instances of one size: ``count`` of them, drawn by (seed, n, m) alone."""
+    """``count`` uniform instances of one size. They depend on (seed, n, m) alone."""
 
     n_nodes: int
     n_agents: int
     count: int
 
     def instances(self, seed: int, distribution: str = "uniform") -> list[Instance]:
-        """The cell's instances; the first k are the same whatever ``count`` is."""
+        """Draw the cell's instances; the first k are the same for every ``count``."""
         rng = np.random.default_rng([seed, self.n_nodes, self.n_agents])
         return [
             sample(distribution, rng, 1, self.n_nodes, self.n_agents).instance(0, f"{self.label}-{i}")
@@ -33,34 +33,34 @@ class Cell:
 
     @property
     def label(self) -> str:
-        """For example "50x5": n = 50, m = 5."""
+        """For example "50x5" for n = 50 and m = 5."""
         return f"{self.n_nodes}x{self.n_agents}"
 
     @property
     def heading(self) -> str:
-        """For a table's head: "50, 5"."""
+        """Head of the cell's column in a table, such as "50, 5"."""
         return f"{self.n_nodes}, {self.n_agents}"
 
     @property
     def printed(self) -> list[str | int]:
-        """What ``published.json`` calls it."""
+        """The cell's name in ``published.json``."""
         return [self.n_nodes, self.n_agents]
 
     def file(self, seed: int) -> str:
-        """Where its best known tours are kept."""
+        """Name of the file with its best known tours."""
         return f"uniform-{self.label}-seed{seed}.json"
 
 
 @dataclass(frozen=True)
 class TsplibCell:
-    """One file of TSPLIB, its first node the depot; not drawn, so that seeds do not matter.
+    """A TSPLIB file; its first node is the depot. The instance does not depend on a seed.
 
     Attributes:
-        file_name: without ".tsp".
-        n_nodes: n, which the file must have.
-        n_agents: m.
-        folder: where the file is; None: not known, and there is no instance.
-        paper_name: what the paper calls it, where it errs.
+        file_name: name of the file without ".tsp".
+        n_nodes: number of nodes that the file must have.
+        n_agents: number of agents.
+        folder: folder with the file; None if it is unknown, and then there is no instance.
+        paper_name: the paper's name for the file, if it differs.
     """
 
     file_name: str
@@ -72,13 +72,13 @@ class TsplibCell:
 
     @property
     def path(self) -> Path | None:
-        """The file itself."""
+        """Path of the file."""
         return self.folder / f"{self.file_name}.tsp" if self.folder else None
 
     def instances(self, seed: int) -> list[Instance]:
-        """The one instance. Raises OSError or ValueError where there is none, or another than expected."""
+        """Read the instance. Raises OSError or ValueError if the file is missing or not as expected."""
         if self.path is None:
-            raise ValueError(f"{self.label} is read from a TSPLIB file: say where with --tsplib DIR")
+            raise ValueError(f"{self.label} is read from a TSPLIB file: name its folder with --tsplib DIR")
         instance = read_tsplib(self.path, self.n_agents)
         if instance.n_nodes != self.n_nodes:
             raise ValueError(f"{self.path}: {self.n_nodes} nodes expected, got {instance.n_nodes}")
@@ -86,28 +86,28 @@ class TsplibCell:
 
     @property
     def label(self) -> str:
-        """For example "eil51x5": m = 5."""
+        """For example "eil51x5" for m = 5."""
         return f"{self.file_name}x{self.n_agents}"
 
     @property
     def heading(self) -> str:
-        """For a table's head: "eil51, 5"."""
+        """Head of the cell's column in a table, such as "eil51, 5"."""
         return f"{self.file_name}, {self.n_agents}"
 
     @property
     def printed(self) -> list[str | int]:
-        """What ``published.json`` calls it."""
+        """The cell's name in ``published.json``."""
         return [self.paper_name or self.file_name, self.n_agents]
 
     def file(self, seed: int) -> str:
-        """Where its best known tours are kept."""
+        """Name of the file with its best known tours."""
         return f"{self.label}.json"
 
 
 AnyCell = Cell | TsplibCell
 
-# The paper prints gtsp150's costs under "kroa150": with TSPLIB's kroA150 and its first node as the depot, the trip to
-# the farthest city and back alone is 5395, with gtsp150 it is the 1554.64 that the row shows.
+# The paper prints the costs of gtsp150 as "kroa150". In TSPLIB's kroA150, with its first node as the depot, the trip to
+# the farthest city and back is 5395 long; in gtsp150 it has the length that the paper prints, 1554.64.
 _TSPLIB = (("eil51", 51), ("eil76", 76), ("eil101", 101), ("gtsp150", 150), ("tsp225", 225))
 
 TABLES: dict[str, tuple[AnyCell, ...]] = {
@@ -120,37 +120,42 @@ TABLES: dict[str, tuple[AnyCell, ...]] = {
         for name, n in _TSPLIB
         for m in ((5, 10) if n < 150 else (10, 20))
     ),
-    "figure4": tuple(Cell(n, 5, 5) for n in (20, 50, 100, 140, 200, 350, 500, 700, 1000)),  # the paper's ends at 140
+    "figure4": tuple(
+        Cell(n, 5, 5) for n in (20, 50, 100, 140, 200, 350, 500, 700, 1000)
+    ),  # the paper's figure ends at 140
     "smoke": (Cell(8, 2, 3),),
 }
 
 
 def cells(table: str, tsplib: Path | None = None, count: int | None = None) -> tuple[AnyCell, ...]:
-    """The cells of a table, with ``count`` instances each (None: as many as TABLES says).
+    """The cells of a table.
 
-    Where ``tsplib`` names a folder, cells whose file is not in it are left out.
+    Args:
+        table: key of TABLES.
+        tsplib: folder with TSPLIB files; cells whose file is not in it are left out.
+        count: number of instances in each cell; by default as in TABLES.
 
     Raises:
-        ValueError: no such table, a bad ``count``, or a folder without any of the files.
+        ValueError: an unknown table, a bad ``count``, or a folder without any of the files.
     """
     if table not in TABLES:
         raise ValueError(f"unknown table {table!r}; choose from {sorted(TABLES)}")
-    found = TABLES[table]
+    chosen = TABLES[table]
     if count is not None:
         check_count("instances", count, minimum=1)
-        if any(isinstance(cell, TsplibCell) for cell in found) and count != 1:
+        if any(isinstance(cell, TsplibCell) for cell in chosen) and count != 1:
             raise ValueError(f"table {table} has 1 instance in each cell, got instances = {count}")
-        found = tuple(replace(cell, count=count) for cell in found)
+        chosen = tuple(replace(cell, count=count) for cell in chosen)
     if tsplib is not None:
-        found = tuple(replace(cell, folder=tsplib) if isinstance(cell, TsplibCell) else cell for cell in found)
-        found = tuple(cell for cell in found if not isinstance(cell, TsplibCell) or cell.path.is_file())
-        if not found:
+        chosen = tuple(replace(cell, folder=tsplib) if isinstance(cell, TsplibCell) else cell for cell in chosen)
+        chosen = tuple(cell for cell in chosen if not isinstance(cell, TsplibCell) or cell.path.is_file())
+        if not chosen:
             raise ValueError(f"{tsplib}: none of {', '.join(f'{name}.tsp' for name, _ in _TSPLIB)}")
-    return found
+    return chosen
 
 
 def find_cell(table: str, label: str) -> AnyCell:
-    """The cell of a table by its label. Raises ValueError where there is none."""
+    """The cell of a table with this label. Raises ValueError if there is none."""
     for cell in cells(table):
         if cell.label == label:
             return cell
@@ -158,9 +163,9 @@ def find_cell(table: str, label: str) -> AnyCell:
 
 
 def rounded_length(instance: Instance, tours: Tours) -> int:
-    """Longest tour in the file's units, each leg rounded to the nearest whole number: TSPLIB 95's rule for EUC_2D.
+    """Longest tour in the file's units, with each leg rounded to the nearest whole number (TSPLIB 95, EUC_2D).
 
-    The paper's Table 3 counts so: two of its costs are below what unrounded lengths allow.
+    The paper's Table 3 rounds in this way: two of its costs are below the optimum for unrounded lengths.
     """
     lengths = (np.linalg.norm(np.diff(instance.nodes[tour], axis=0), axis=1) * instance.scale for tour in tours)
     return max(int(np.floor(legs + 0.5).sum()) for legs in lengths)

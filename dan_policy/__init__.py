@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from dan_policy.actor import make_actor
     from dan_policy.dan import DAN, DANConfig
     from dan_policy.episode import Episode, rollout
+    from dan_policy.joint import JointConfig, JointDAN
     from dan_policy.layers import AttentionLayer
     from dan_policy.planning import Solution, SolveOptions, solve
     from dan_policy.registry import NETWORKS, build, load, save
@@ -20,6 +21,8 @@ _MODULES = {
     "AttentionLayer": "layers",
     "DANConfig": "dan",
     "Episode": "episode",
+    "JointConfig": "joint",
+    "JointDAN": "joint",
     "Solution": "planning",
     "SolveOptions": "planning",
     "build": "registry",
@@ -36,6 +39,8 @@ __all__ = [
     "AttentionLayer",
     "DANConfig",
     "Episode",
+    "JointConfig",
+    "JointDAN",
     "Solution",
     "SolveOptions",
     "build",

@@ -1,6 +1,6 @@
 """What ``solve`` chooses by itself if it is not given: how sharp samples are, how far agents see, which precision.
 
-The numbers were measured with ``python -m benchmarks clip`` and ``python -m benchmarks view``.
+The numbers were measured with ``python -m benchmarks sweep-clip`` and ``sweep-view``.
 """
 
 from __future__ import annotations

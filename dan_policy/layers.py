@@ -74,13 +74,17 @@ def masked_mean(h: Tensor, mask: Tensor | None = None) -> Tensor:
     return weight[:, None, :] @ h
 
 
-def open_nodes(cities: Tensor, visited: Tensor, view: int | None = None) -> tuple[Tensor, Tensor | None]:
+def open_nodes(
+    cities: Tensor, visited: Tensor, view: int | None = None, other_tokens: int = 0
+) -> tuple[Tensor, Tensor | None]:
     """The nodes to encode if visited cities are dropped: each row's unvisited ones, the depot first.
 
     Args:
         cities: (B, n, 2), coordinates relative to the deciding agent.
         visited: (B, n) bool, False at the depot.
         view: keep at most this many cities per row, the nearest ones; None keeps all.
+        other_tokens: number of tokens that are encoded in one sequence with the nodes; under autocast the length of
+            the whole sequence is one of ``padded_length``'s.
 
     Returns:
         Their indices (B, k) int64, padded to the longest row, and a mask (B, k) bool that is False at the padding;
@@ -94,7 +98,7 @@ def open_nodes(cities: Tensor, visited: Tensor, view: int | None = None) -> tupl
         kept = distance.topk(1 + view, dim=1, largest=False).indices  # (B, k)
     else:
         if torch.is_autocast_enabled(cities.device.type):
-            longest = min(padded_length(longest), visited.shape[1])
+            longest = min(padded_length(other_tokens + longest) - other_tokens, visited.shape[1])
         kept = torch.argsort(visited.to(torch.uint8), dim=1, stable=True)[:, :longest]  # (B, k)
     real = is_open.gather(1, kept)
     return kept, None if bool(real.all()) else real

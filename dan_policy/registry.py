@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from dan_policy.actor import Network, network_keys
 from dan_policy.dan import DAN, DANConfig
+from dan_policy.joint import JointConfig, JointDAN
 from mtsp_env.files import atomic_write
 
 FORMAT = "dan-policy-2"
@@ -43,6 +44,7 @@ class NetworkType:
 
 NETWORKS: dict[str, NetworkType] = {
     "dan": NetworkType(DANConfig, DAN),
+    "joint": NetworkType(JointConfig, JointDAN),
 }
 
 

@@ -1,4 +1,4 @@
-"""Files of our own: instances and tours as JSON, and the one way in which this project writes a file."""
+"""Instances and tours as JSON files, and the atomic write with which all packages write files."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from mtsp_env.instance import FIELDS, Instance, Tours
 
 @contextmanager
 def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
-    """A temporary path beside ``path`` to write to; it replaces ``path`` when the block ends without an error.
+    """Give a temporary path in the folder of ``path``; the file written there replaces ``path`` when the block ends.
 
-    A failure or a crash leaves the older file as it was.
+    If the block raises an error, or the process dies, an existing file stays as it was.
 
     >>> with atomic_write("tours.json") as temporary:
     ...     temporary.write_text("{}")
@@ -32,7 +32,7 @@ def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def write_json(path: str | os.PathLike, data: dict) -> None:
-    """Write one JSON object, atomically."""
+    """Write a JSON object, atomically."""
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(data), encoding="utf-8")
 
@@ -42,11 +42,11 @@ def read_json(path: str | os.PathLike, keys: Sequence[str]) -> dict:
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: not such a file.
+        ValueError: the file is no JSON object with these keys.
     """
     try:
         data = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:  # not JSON, not text, or nested without end
+    except (ValueError, RecursionError) as error:  # not JSON, not text, or nested deeper than Python can read
         raise ValueError(f"{path}: not a JSON file ({error})") from error
     if not isinstance(data, dict) or not set(keys) <= data.keys():
         raise ValueError(f"{path}: expected a JSON object with the keys {list(keys)}")
@@ -54,20 +54,20 @@ def read_json(path: str | os.PathLike, keys: Sequence[str]) -> dict:
 
 
 def write_instance(path: str | os.PathLike, instance: Instance) -> None:
-    """Write an instance as JSON: {"name", "n_agents", "scale", "nodes"} and the fields of its world.
+    """Write an instance as a JSON object with the keys name, n_agents, scale, nodes and those of its world fields.
 
-    JSON has no infinity; ``null`` stands for it.
+    ``null`` in an array stands for infinity, which JSON does not have.
     """
     arrays = {name: _replace(array.tolist(), math.inf, None) for name, array in instance.arrays().items()}
     write_json(path, {"name": instance.name, "n_agents": instance.n_agents, "scale": instance.scale, **arrays})
 
 
 def read_instance(path: str | os.PathLike, n_agents: int | None = None) -> Instance:
-    """Read what ``write_instance`` wrote; ``n_agents``, if given, replaces the file's number of agents.
+    """Read a file of ``write_instance``; ``n_agents``, if given, replaces the file's number of agents.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: not such a file, or not a valid instance.
+        ValueError: the file holds no valid instance.
     """
     data = read_json(path, keys=("nodes", "n_agents"))
     arrays = {}
@@ -87,23 +87,23 @@ def read_instance(path: str | os.PathLike, n_agents: int | None = None) -> Insta
 
 
 def _replace(values: Any, old: Any, new: Any) -> Any:
-    """Nested lists with every ``old`` replaced by ``new``."""
+    """A copy of nested lists in which ``new`` replaces every ``old``."""
     if isinstance(values, list):
         return [_replace(value, old, new) for value in values]
     return new if values == old else values
 
 
 def write_tours(path: str | os.PathLike, tours: Tours, **extra: object) -> None:
-    """Write tours as JSON: {"tours": [[0, ..., 0], ...]} and the JSON values of ``extra`` beside them."""
+    """Write tours as a JSON object: {"tours": [[0, ..., 0], ...]}, and ``extra`` as further keys."""
     write_json(path, {"tours": [[int(node) for node in tour] for tour in tours], **extra})
 
 
 def read_tours(path: str | os.PathLike) -> Tours:
-    """Read the tours that ``write_tours`` wrote; ``tours.check_tours`` says whether they solve an instance.
+    """Read the tours in a file of ``write_tours``; ``tours.check_tours`` checks whether they solve an instance.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: not such a file.
+        ValueError: the file holds no tours.
     """
     tours = read_json(path, keys=("tours",))["tours"]
     if not isinstance(tours, list) or not all(

@@ -1,4 +1,4 @@
-"""Pictures of tours. Needs the extra ``render`` (matplotlib), which is imported where the first picture is drawn."""
+"""Pictures of tours. Drawing needs the extra ``render``: matplotlib, which is imported with the first picture."""
 
 from __future__ import annotations
 
@@ -20,24 +20,33 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = (
-    # Okabe and Ito's colours, then the ones that stay farthest from them and each other under normal vision,
-    # deuteranopia and protanopia. Agents from 20 on repeat them with dashed lines.
+    # First Okabe and Ito's colours, then those that differ most from them and from each other under normal vision,
+    # deuteranopia and protanopia. Agents from 20 on repeat the colours with dashed lines.
     *("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#0000ff", "#691e00", "#5a1e4b", "#2d1ea5"),
     *("#5a78ff", "#69d278", "#ffa5b4", "#d22d4b", "#2d2d78", "#691e2d", "#3c4bf0", "#874b69", "#a53c0f", "#4b96f0"),
 )
 UNVISITED = "#8c8c8c"
-LEGEND_ROWS = 24  # with more agents only so many of the longest tours are listed
+LEGEND_ROWS = 24  # with more agents, the legend lists only this many of the longest tours
 
 
 def draw_tours(instance: Instance, tours: Sequence[Sequence[int]], ax: Axes | None = None) -> Axes:
-    """Draw tours, finished or so far, into ``ax`` or a new figure (``.figure`` of what is returned).
+    """Draw finished or partial tours.
 
-    One colour per agent, the depot a black square, unvisited cities hollow. A tour that is still open has no return leg
-    and a ring where its agent is or heads for. The legend gives lengths in the instance's units; the longest is bold.
+    Each agent has a colour, the depot is a black square, and unvisited cities are hollow. A tour that is still open has
+    no return leg, and a ring marks its agent's destination. The legend gives lengths in the instance's units; the
+    longest tour is bold.
+
+    Args:
+        instance: the problem.
+        tours: one per agent; a tour that does not end at the depot is still open.
+        ax: where to draw; None: into a new figure that belongs to no window.
+
+    Returns:
+        The axes; ``.figure`` is their figure.
 
     Raises:
         ImportError: matplotlib is not installed.
-        ValueError: not one tour per agent, a tour that does not begin at the depot, or a node that does not exist.
+        ValueError: there is not one tour per agent, a tour does not begin at the depot, or a node does not exist.
     """
     _check_drawable(instance, tours)
     if ax is None:
@@ -49,14 +58,14 @@ def draw_tours(instance: Instance, tours: Sequence[Sequence[int]], ax: Axes | No
 def save_picture(
     path: str | os.PathLike, instance: Instance, tours: Sequence[Sequence[int]], title: str | None = None
 ) -> None:
-    """Draw tours into a file of any type that matplotlib knows by its suffix: .png, .svg, .pdf, ...
+    """Draw tours into a file; its suffix decides the format: .png, .svg, .pdf, ...
 
-    A failure leaves an older file as it was.
+    If this fails, an existing file stays as it was. ``title`` replaces the default title.
 
     Raises:
         ImportError: matplotlib is not installed.
         OSError: the file cannot be written.
-        ValueError: an unknown suffix, or tours that ``draw_tours`` refuses.
+        ValueError: the suffix is unknown, or ``draw_tours`` refuses the tours.
     """
     suffix = check_suffix(path)
     figure = _new_figure(_fitting_size(instance))
@@ -68,12 +77,17 @@ def save_picture(
 
 
 def check_suffix(path: str | os.PathLike) -> str:
-    """The picture format that a path's suffix names; ValueError where matplotlib does not know it."""
+    """The picture format that a path's suffix names.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+        ValueError: matplotlib cannot write such a file.
+    """
     try:
         from matplotlib.backend_bases import FigureCanvasBase
     except ImportError as error:
         raise _missing() from error
-    known = sorted(set(FigureCanvasBase.get_supported_filetypes()) - {"pgf"})  # which would run TeX
+    known = sorted(set(FigureCanvasBase.get_supported_filetypes()) - {"pgf"})  # pgf would run TeX
     suffix = Path(path).suffix.lower().removeprefix(".")
     if suffix not in known:
         raise ValueError(f"{os.fspath(path)}: unknown picture suffix {suffix!r}; choose from {known}")
@@ -81,16 +95,16 @@ def check_suffix(path: str | os.PathLike) -> str:
 
 
 def format_lengths(lengths: Sequence[float]) -> list[str]:
-    """Lengths for people to compare: as many decimals for all as give the longest four digits."""
+    """Lengths as text, all with as many decimals as the longest needs for four digits."""
     longest = max(lengths, default=0.0)
     decimals = min(max(3 - math.floor(math.log10(longest)), 0), 12) if longest > 0 else 0
     return [f"{length:,.{decimals}f}" for length in lengths]
 
 
 class Viewer:
-    """Draws game after game into one figure: a window (``show``) or an array.
+    """Draws one game after another into the same figure, shown in a window (``show``) or returned as an array.
 
-    A window never blocks. Where matplotlib's backend has none (MPLBACKEND=Agg, no display) nothing is shown.
+    A window never blocks. If matplotlib's backend has no windows (MPLBACKEND=Agg, no display), nothing is shown.
     """
 
     def __init__(self, show: bool):
@@ -99,11 +113,11 @@ class Viewer:
         self._instance: Instance | None = None
 
     def draw(self, instance: Instance, tours: Sequence[Sequence[int]]) -> np.ndarray | None:
-        """The picture of ``tours``, uint8 (600, 800, 3), or None where it goes to a window.
+        """Draw ``tours``; returns the picture, uint8 (600, 800, 3), or None if it is shown in a window.
 
         Raises:
             ImportError: matplotlib is not installed.
-            ValueError: tours that ``draw_tours`` refuses.
+            ValueError: ``draw_tours`` refuses the tours.
         """
         _check_drawable(instance, tours)
         if self._figure is None or (self.show and not _is_open(self._figure)):
@@ -122,9 +136,9 @@ class Viewer:
             return None
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-        assert isinstance(canvas, FigureCanvasAgg)  # of _new_figure
+        assert isinstance(canvas, FigureCanvasAgg)  # see _new_figure
         canvas.draw()
-        return np.array(np.asarray(canvas.buffer_rgba())[:, :, :3])  # a copy: the canvas draws into its own again
+        return np.array(np.asarray(canvas.buffer_rgba())[:, :, :3])  # a copy: the canvas reuses its buffer
 
     def close(self) -> None:
         """Close the window, if there is one; drawing again opens a new one."""
@@ -136,7 +150,7 @@ class Viewer:
 
 
 class _Picture:
-    """The artists of one instance's picture, made once; ``update`` moves them, which is faster than drawing anew."""
+    """The artists of one instance's picture, made once; ``update`` moves them, which is faster than making new ones."""
 
     def __init__(self, ax: Axes, instance: Instance):
         self.ax, self.instance = ax, instance
@@ -165,7 +179,7 @@ class _Picture:
         margin = 0.03 * (np.ptp(nodes, axis=0).max() or 1.0)
         ax.set_xlim(nodes[:, 0].min() - margin, nodes[:, 0].max() + margin)
         ax.set_ylim(nodes[:, 1].min() - margin, nodes[:, 1].max() + margin)
-        ax.set(aspect="equal", xticks=[], yticks=[])  # hidden ticks would still cost time
+        ax.set(aspect="equal", xticks=[], yticks=[])  # hidden ticks would still take time
         ax.axis("off")
 
     def update(self, tours: Sequence[Sequence[int]]) -> None:
@@ -173,7 +187,7 @@ class _Picture:
         lengths = path_lengths(nodes, tours) * self.instance.scale  # (m,)
         longest = int(lengths.argmax()) if lengths.any() else None
 
-        owner = np.full(len(nodes), -1)  # which agent visits a node
+        owner = np.full(len(nodes), -1)  # (n,) the agent that visits each node; -1: none
         for agent, (line, tour) in enumerate(zip(self.lines, tours, strict=True)):
             line.set_data(*nodes[list(tour)].T)
             line.set_linewidth(self.bold if agent == longest else self.thin)
@@ -189,17 +203,17 @@ class _Picture:
         heads = nodes[[tours[agent][-1] for agent in open_tours]]
         self.heads.set(offsets=heads, edgecolor=self.colours[open_tours])
 
-        written = format_lengths(lengths.tolist())
-        self._write_legend(lengths, written, longest)
-        title = self._title(written[longest or 0], int(visited.sum()), bool(open_tours))
+        labels = format_lengths(lengths.tolist())
+        self._update_legend(lengths, labels, longest)
+        title = self._title(labels[longest or 0], int(visited.sum()), bool(open_tours))
         self.ax.set_title(title, parse_math=False)
 
-    def _write_legend(self, lengths: np.ndarray, written: list[str], longest: int | None) -> None:
+    def _update_legend(self, lengths: np.ndarray, labels: list[str], longest: int | None) -> None:
         listed = np.sort(np.argsort(-lengths, kind="stable")[:LEGEND_ROWS])
         for agent, handle, text in zip(listed, self.legend.get_lines(), self.legend.get_texts(), strict=True):
             handle.set(color=self.colours[agent], linestyle=self.lines[agent].get_linestyle())
             handle.set_linewidth(self.bold if agent == longest else self.thin)
-            text.set_text(f"agent {agent}:  {written[agent]}{'  longest' if agent == longest else ''}")
+            text.set_text(f"agent {agent}:  {labels[agent]}{'  longest' if agent == longest else ''}")
             text.set_fontweight("bold" if agent == longest else "normal")
 
     def _title(self, longest: str, visited: int, any_open: bool) -> str:
@@ -221,13 +235,13 @@ def _check_drawable(instance: Instance, tours: Sequence[Sequence[int]]) -> None:
 
 
 def _fitting_size(instance: Instance) -> tuple[float, float]:
-    """Inches (width, height) that leave little empty beside instances that are wide or high."""
+    """Size (width, height) in inches that leaves little empty space around wide or high instances."""
     width, height = np.ptp(instance.nodes, axis=0) + 0.06
     return float(np.clip(7 * width / height, 3, 7)), float(np.clip(7 * height / width, 3, 7))
 
 
 def _colours(n_agents: int) -> np.ndarray:
-    """RGBA (m, 4)."""
+    """The agents' colours, RGBA (m, 4)."""
     from matplotlib.colors import to_rgba_array
 
     return to_rgba_array([COLOURS[agent % len(COLOURS)] for agent in range(n_agents)])
@@ -240,7 +254,7 @@ def _rgba(colour: str) -> tuple[float, ...]:
 
 
 def _new_figure(size: tuple[float, float]) -> Figure:
-    """A figure that belongs to no window and no pyplot state."""
+    """A figure of a size in inches that belongs to no window and no pyplot state."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure

@@ -1,4 +1,4 @@
-"""The only judge of tours: lengths, makespan, validity and a lower bound. No solver's own cost is ever trusted."""
+"""The only judge of tours: lengths, makespan, validity, and a lower bound. A solver's own cost is never trusted."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ from mtsp_env.instance import Instance, Tours, check_plain
 
 
 def path_lengths(nodes: np.ndarray, paths: Sequence[Sequence[int]]) -> np.ndarray:
-    """Length of each path through ``nodes`` (n, 2), float64 (len(paths),); a path is a list of node numbers."""
+    """Length of each path, a list of rows of ``nodes`` (n, 2): float64 (len(paths),)."""
     return np.array([np.linalg.norm(np.diff(nodes[list(path)], axis=0), axis=1).sum() for path in paths])
 
 
 def tour_lengths(instance: Instance, tours: Sequence[Sequence[int]]) -> np.ndarray:
-    """Length of each tour, float64 (len(tours),), in unit-square units; times ``instance.scale`` in the source's.
+    """Length of each tour, float64 (len(tours),), in units of the unit square.
+
+    Multiply by ``instance.scale`` for the units of the file that the instance was read from.
 
     Raises:
         ValueError: the instance is not plain.
@@ -25,7 +27,7 @@ def tour_lengths(instance: Instance, tours: Sequence[Sequence[int]]) -> np.ndarr
 
 
 def makespan(instance: Instance, tours: Sequence[Sequence[int]]) -> float:
-    """Length of the longest tour, in unit-square units: the paper's objective (Sec. 3), to be minimised.
+    """Length of the longest tour, in units of the unit square: the paper's objective (Sec. 3), to be minimised.
 
     Raises:
         ValueError: the instance is not plain.
@@ -34,10 +36,14 @@ def makespan(instance: Instance, tours: Sequence[Sequence[int]]) -> float:
 
 
 def check_tours(instance: Instance, tours: Sequence[Sequence[int]]) -> None:
-    """Raise ValueError unless ``tours`` solve ``instance``.
+    """Check that ``tours`` solve ``instance``.
 
-    One tour per agent, each beginning and ending at the depot, every city on exactly one of them, once. A tour may pass
-    the depot in between (the environment's depot rule "open" allows it); ``[0, 0]`` is an agent that stays at home.
+    There must be one tour per agent, each from the depot to the depot, that together visit every city exactly once. A
+    tour may pass the depot in the middle, as the environment's depot rule "open" allows; the tour of an agent that
+    stays at home is ``[0, 0]``.
+
+    Raises:
+        ValueError: the tours do not solve the instance; the message names the tour or the cities.
     """
     if len(tours) != instance.n_agents:
         raise ValueError(f"expected {instance.n_agents} tours, one per agent, got {len(tours)}")
@@ -61,13 +67,13 @@ def check_tours(instance: Instance, tours: Sequence[Sequence[int]]) -> None:
 
 
 def check_prefixes(instance: Instance, prefixes: Sequence[Sequence[int]]) -> Tours:
-    """The beginnings of tours, one per agent, as lists of ints.
+    """Check the beginnings of tours, one per agent, and return them as lists of ints.
 
-    [0, 3, 5] has visited city 3 and is at city 5 or on its way there, [0] has not left yet, [0, 3, 0] is home for good;
-    ``rules.tours(..., close=False)`` returns a game's tours in this form.
+    [0, 3, 5]: the agent has visited city 3 and is at city 5 or on its way there; [0]: it has not left yet; [0, 3, 0]:
+    it is home for good. ``rules.tours(..., close=False)`` returns a game's tours in this form.
 
     Raises:
-        ValueError: no tours that solve the instance begin like this.
+        ValueError: no tours that solve the instance begin with these prefixes.
     """
     if len(prefixes) != instance.n_agents:
         raise ValueError(f"expected {instance.n_agents} prefixes, one per agent, got {len(prefixes)}")
@@ -83,7 +89,7 @@ def check_prefixes(instance: Instance, prefixes: Sequence[Sequence[int]]) -> Tou
                 raise ValueError(f"city {node} is in the prefixes more than once")
             seen.add(node)
         if 0 in prefix[1:-1]:
-            raise ValueError(f"prefix {agent} must not pass the depot in between, got {prefix}")
+            raise ValueError(f"prefix {agent} must not pass the depot in the middle, got {prefix}")
     if len(seen) < instance.n_nodes and all(map(is_closed, lists)):
         raise ValueError(f"all agents are home for good, and {instance.n_nodes - len(seen)} cities are left")
     return lists
@@ -95,21 +101,24 @@ def is_closed(prefix: Sequence[int]) -> bool:
 
 
 def _cities(numbers: np.ndarray) -> str:
-    named = ", ".join(str(number) for number in numbers[:5])
-    return f"city {named}" if len(numbers) == 1 else f"cities {named}{', ...' if len(numbers) > 5 else ''}"
+    listed = ", ".join(str(number) for number in numbers[:5])
+    return f"city {listed}" if len(numbers) == 1 else f"cities {listed}{', ...' if len(numbers) > 5 else ''}"
 
 
 def farthest_trip(nodes: np.ndarray) -> float:
-    """Length of the trip to the city farthest from the depot and back: no makespan is shorter. nodes (n, 2)."""
+    """Length of the trip to the city farthest from the depot and back, a lower bound on the makespan. nodes (n, 2)."""
     nodes = np.asarray(nodes, dtype=np.float64)
     return 2.0 * float(np.linalg.norm(nodes - nodes[0], axis=1).max())
 
 
 def lower_bound(instance: Instance) -> float:
-    """No makespan is below this: the farthest out-and-back trip, or, if larger, the minimum spanning tree over m.
+    """A lower bound on the makespan: the larger of ``farthest_trip`` and the minimum spanning tree's length over m.
 
-    The m tours together hold a spanning tree of all nodes, so the longest is at least the tree's length over m.
+    The m tours together contain a spanning tree of all nodes, so the longest is at least the tree's length over m.
     O(n^2) time, O(n) memory (Prim's algorithm).
+
+    Raises:
+        ValueError: the instance is not plain.
     """
     check_plain(instance)
     nodes = instance.nodes

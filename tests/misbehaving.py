@@ -1,4 +1,4 @@
-"""Solvers for the tests of ``run``, named there as "misbehaving:function". All but one behave on the warm-up."""
+"""Solvers for the tests of ``run``, by the names "misbehaving:function". All but one behave during the warm-up."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from pathlib import Path
 
 from benchmarks.solvers import Answer, NoTours, Unavailable
 
-FOLDER = "MISBEHAVING_FOLDER"  # environment variable: where ``hangs`` leaves the numbers of its processes
+FOLDER = "MISBEHAVING_FOLDER"  # environment variable: folder to which ``hangs`` writes the numbers of its processes
 calls = 0
 
 
 def deals(instance, seconds, seed):
-    """Right tours: the cities are dealt out like cards."""
+    """Valid tours: the cities are dealt out like cards."""
     tours = [[0] for _ in range(instance.n_agents)]
     for city in range(1, instance.n_nodes):
         tours[city % instance.n_agents].append(city)
@@ -29,7 +29,7 @@ def proves(instance, seconds, seed):
 
 
 def hangs(instance, seconds, seed):
-    """Never ends, with a child, deaf to polite signals; only where the folder's file "behave" is missing."""
+    """Hang with a child process and ignore polite signals, unless the folder has a file "behave"."""
     folder = Path(os.environ[FOLDER])
     if instance.name in ("warm-up", "8x2-0", "8x2-1") or (folder / "behave").exists():
         return deals(instance, seconds, seed)
@@ -78,7 +78,7 @@ def halves(instance, seconds, seed):
     return [[float(node) for node in tour] for tour in deals(instance, seconds, seed)]
 
 
-def says_nothing(instance, seconds, seed):
+def returns_nothing(instance, seconds, seed):
     return None
 
 
@@ -95,14 +95,14 @@ def finds_nothing(instance, seconds, seed):
 
 
 def counts(instance, seconds, seed):
-    """Tells how often it was called in this process, and with what."""
+    """Report the number of calls in this process, and the arguments."""
     global calls
     calls += 1
     raise RuntimeError(json.dumps([calls, instance.name, seconds, seed]))
 
 
 def looks_around(instance, seconds, seed):
-    """Tells what its process may use."""
+    """Report what this process may use."""
     names = [name for name in os.environ if name.endswith("_THREADS")]
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
     seen = {

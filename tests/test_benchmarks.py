@@ -1,6 +1,7 @@
-"""Test sets stay what they are, best known tours only improve, solvers are found by name."""
+"""Test sets never change, best known tours only improve, solvers are loaded by name, speed is measured."""
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -9,11 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from made_up import one_agent_does_it_all, row
 from misbehaving import deals
 
-from benchmarks import best, rows, solvers, speed, speed_solve, speed_train, suite
-from benchmarks.__main__ import main
+from benchmarks import best_known, solvers, suite
+from benchmarks.__main__ import COMMANDS, load, main
+from benchmarks.harness.journal import Journal
+from benchmarks.studies import speed, speed_peers, speed_solve, speed_train, timing
 from benchmarks.suite import SEED, TABLES, Cell, TsplibCell
 from dan_policy import DAN, DANConfig
 from mtsp_env import check_tours, lower_bound, makespan
@@ -33,7 +37,7 @@ def test_instances_depend_on_seed_and_size_alone():
 
 
 def test_the_tables_are_the_papers():
-    published = json.loads((ROOT / "benchmarks" / "published.json").read_text(encoding="utf-8"))
+    published = json.loads((ROOT / "benchmarks" / "reports" / "published.json").read_text(encoding="utf-8"))
     for number in "123":
         table = published[f"table{number}"]
         assert [cell.printed for cell in TABLES[number]] == table["cells"]
@@ -58,21 +62,21 @@ def test_the_tables_are_the_papers():
 def test_best_known_tours_only_ever_improve(tmp_path):
     instances = Cell(8, 2, 5).instances(1)
     poor, good = one_agent_does_it_all(instances[0]), [[0, 1, 2, 3, 0], [0, 4, 5, 6, 7, 0]]  # halves of the poor one
-    assert best.merge(CELL, 1, {0: poor, 2: good}, tmp_path) == 2
-    assert best.read(CELL, 1, tmp_path) == {0: poor, 2: good}
-    assert best.merge(CELL, 1, {0: good, 1: poor, 2: poor, 4: poor}, tmp_path) == 3
-    assert best.read(CELL, 1, tmp_path) == {0: good, 1: poor, 2: good}
-    assert best.read(replace(CELL, count=9), 1, tmp_path) == {0: good, 1: poor, 2: good, 4: poor}
+    assert best_known.merge(CELL, 1, {0: poor, 2: good}, tmp_path) == 2
+    assert best_known.read(CELL, 1, tmp_path) == {0: poor, 2: good}
+    assert best_known.merge(CELL, 1, {0: good, 1: poor, 2: poor, 4: poor}, tmp_path) == 3
+    assert best_known.read(CELL, 1, tmp_path) == {0: good, 1: poor, 2: good}
+    assert best_known.read(replace(CELL, count=9), 1, tmp_path) == {0: good, 1: poor, 2: good, 4: poor}
     written = (tmp_path / CELL.file(1)).read_bytes()
-    assert best.merge(CELL, 1, {0: poor, 2: good}, tmp_path) == 0
+    assert best_known.merge(CELL, 1, {0: poor, 2: good}, tmp_path) == 0
     assert (tmp_path / CELL.file(1)).read_bytes() == written
     assert len(list(tmp_path.iterdir())) == 1
-    assert best.read(CELL, 2, tmp_path) == {}
+    assert best_known.read(CELL, 2, tmp_path) == {}
 
 
 def test_wrong_tours_are_neither_kept_nor_read(tmp_path):
     with pytest.raises(ValueError, match="missing"):
-        best.merge(CELL, 1, {0: [[0, 1, 0], [0, 0]]}, tmp_path)
+        best_known.merge(CELL, 1, {0: [[0, 1, 0], [0, 0]]}, tmp_path)
     assert not list(tmp_path.iterdir())
     for text, message in [
         (json.dumps([None, [[0, 1, 0], [0, 0]]]), "instance 1: cities 2, 3, 4, 5, 6, ... missing"),
@@ -81,60 +85,62 @@ def test_wrong_tours_are_neither_kept_nor_read(tmp_path):
     ]:
         (tmp_path / CELL.file(1)).write_text(text)
         with pytest.raises(ValueError, match=message):
-            best.read(CELL, 1, tmp_path)
+            best_known.read(CELL, 1, tmp_path)
         with pytest.raises(ValueError, match=message):
-            best.merge(CELL, 1, {0: one_agent_does_it_all(CELL.instances(1)[0])}, tmp_path)
+            best_known.merge(CELL, 1, {0: one_agent_does_it_all(CELL.instances(1)[0])}, tmp_path)
 
 
 def test_results_give_their_better_tours(tmp_path):
     instances = CELL.instances(7)
-    best.merge(CELL, 7, {0: deals(instances[0], 1, 0)}, tmp_path)
+    best_known.merge(CELL, 7, {0: deals(instances[0], 1, 0)}, tmp_path)
     good = [row(i, deals(i, 1, 0), k) for k, i in enumerate(instances)]
-    found = [*good, *(row(i, one_agent_does_it_all(i), k) for k, i in enumerate(instances))]
-    failed = replace(found[0], status="error", tours=None, makespan=None)
-    assert best.merge_rows([failed, *found], folder=tmp_path) == ["8x2: 2 of 3 improved"]
-    assert best.read(CELL, 7, tmp_path) == {k: deals(i, 1, 0) for k, i in enumerate(instances)}
-    assert best.merge_rows(found, folder=tmp_path) == ["8x2: 0 of 3 improved"]
-    assert best.merge_rows([], folder=tmp_path) == []
+    results = [*good, *(row(i, one_agent_does_it_all(i), k) for k, i in enumerate(instances))]
+    failed = replace(results[0], status="error", tours=None, makespan=None)
+    assert best_known.merge_rows([failed, *results], folder=tmp_path) == ["8x2: 2 of 3 improved"]
+    assert best_known.read(CELL, 7, tmp_path) == {k: deals(i, 1, 0) for k, i in enumerate(instances)}
+    assert best_known.merge_rows(results, folder=tmp_path) == ["8x2: 0 of 3 improved"]
+    assert best_known.merge_rows([], folder=tmp_path) == []
 
 
-def test_the_search_improves_and_the_check_tells_what_is_proved(tmp_path):
+def test_the_search_improves_and_the_check_counts_what_is_proved(tmp_path):
     instances = CELL.instances(7)
-    best.merge(CELL, 7, {k: one_agent_does_it_all(i) for k, i in enumerate(instances)}, tmp_path)
-    assert best.search(CELL, 7, 0.02, workers=2, folder=tmp_path) == "8x2: 3 of 3 improved"
-    costs = [makespan(i, tours) for i, tours in zip(instances, best.read(CELL, 7, tmp_path).values(), strict=True)]
+    best_known.merge(CELL, 7, {k: one_agent_does_it_all(i) for k, i in enumerate(instances)}, tmp_path)
+    assert best_known.search_cell(CELL, 7, 0.02, workers=2, folder=tmp_path) == "8x2: 3 of 3 improved"
+    costs = [
+        makespan(i, tours) for i, tours in zip(instances, best_known.read(CELL, 7, tmp_path).values(), strict=True)
+    ]
     proved = sum(cost <= lower_bound(i) + 1e-9 for cost, i in zip(costs, instances, strict=True))
-    said = f"8x2: 3 of 3 instances, mean {sum(costs) / 3:.4f}, {proved} at the lower bound"
-    assert best.check(CELL, 7, tmp_path) == said
-    assert best.kept_cells(folder=tmp_path) == [(CELL, 7)]
-    assert best.check(CELL, 8, tmp_path) == "8x2: 0 of 3 instances, 0 at the lower bound"
+    line = f"8x2: 3 of 3 instances, mean {sum(costs) / 3:.4f}, {proved} at the lower bound"
+    assert best_known.verify(CELL, 7, tmp_path) == line
+    assert best_known.kept_cells(folder=tmp_path) == [(CELL, 7)]
+    assert best_known.verify(CELL, 8, tmp_path) == "8x2: 0 of 3 instances, 0 at the lower bound"
 
 
 def test_the_kept_best_known_tours_solve_their_instances():
-    kept = best.kept_cells()
+    kept = best_known.kept_cells()
     assert {cell.label for cell, seed in kept if seed == SEED} >= {"50x5", "100x10"}
     for cell, seed in kept:
-        for instance, tours in zip(cell.instances(seed), best.read(cell, seed).values(), strict=True):
+        for instance, tours in zip(cell.instances(seed), best_known.read(cell, seed).values(), strict=True):
             assert makespan(instance, tours) >= lower_bound(instance) - 1e-9
 
 
 def test_the_command_takes_better_tours_and_verifies(tmp_path, monkeypatch, capsys):
-    for name in ("read", "merge_rows", "check", "kept_cells"):
-        function = getattr(best, name)
+    for name in ("read", "merge_rows", "verify", "kept_cells"):
+        function = getattr(best_known, name)
         monkeypatch.setattr(function, "__defaults__", (*function.__defaults__[:-1], tmp_path))
     instance = CELL.instances(7)[0]
-    with rows.Journal(tmp_path / "rows.jsonl") as journal:
+    with Journal(tmp_path / "rows.jsonl") as journal:
         journal.append(row(instance, deals(instance, 1, 0), 0))
     assert main(["best", "--merge", str(tmp_path / "rows.jsonl"), "--check"]) == 0
-    said = capsys.readouterr().out.splitlines()
-    assert said[0] == "8x2: 1 of 1 improved" and said[1].startswith("8x2: 1 of 1 instances, mean ")
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "8x2: 1 of 1 improved" and lines[1].startswith("8x2: 1 of 1 instances, mean ")
     assert main(["best", "--check", "--table", "smoke"]) == 0
     assert capsys.readouterr().out.startswith("8x2: 1 of 3 instances")
     (tmp_path / CELL.file(7)).write_text("[[[0, 1, 0], [0, 0]]]")
     assert main(["best", "--check"]) == 2
     assert f"{CELL.file(7)}: instance 0: cities 2, 3" in capsys.readouterr().err
     assert main(["best"]) == 2
-    assert "say what to do" in capsys.readouterr().err
+    assert "choose at least one of --merge FILES, --search SECONDS and --check" in capsys.readouterr().err
 
 
 # Solvers
@@ -152,7 +158,7 @@ def test_our_solvers_solve_tiny_instances_and_repeat_themselves(name):
 
 
 def test_naming_solvers_loads_none_and_each_has_a_file():
-    code = "import sys; import benchmarks.worker, benchmarks.run; print(sorted(sys.modules))"
+    code = "import sys; import benchmarks.harness.worker, benchmarks.harness.run; print(sorted(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     heavy = {"torch", "numba", "ortools", "elkai", "highspy", "scipy", "matplotlib"}
     assert not heavy & {name.strip("'") for name in done.stdout.strip("[]\n").split(", ")}
@@ -160,7 +166,7 @@ def test_naming_solvers_loads_none_and_each_has_a_file():
     assert not missing
 
 
-def test_solvers_are_found_by_name(tmp_path, monkeypatch):
+def test_solvers_are_loaded_by_name(tmp_path, monkeypatch):
     (tmp_path / "needy.py").write_text("import a_package_that_nobody_has")
     monkeypatch.syspath_prepend(tmp_path)
     assert solvers.find("misbehaving:deals") is deals
@@ -181,16 +187,16 @@ def test_solvers_are_found_by_name(tmp_path, monkeypatch):
 
 def test_speed_is_work_over_time(monkeypatch):
     clock = iter([0.0, 1.0, 2.0, 4.0])
-    monkeypatch.setattr(speed.time, "perf_counter", lambda: next(clock))
-    assert speed.per_second(lambda: 6, seconds=3.0) == 6 * 2 / 4  # two rounds end before 3 s, after 4 s it looks
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: next(clock))
+    assert timing.per_second(lambda: 6, seconds=3.0) == 6 * 2 / 4  # the second ends after 4 s
 
 
-def test_plans_are_timed_and_their_memory_is_measured(monkeypatch):
-    monkeypatch.setattr(speed_solve.torch, "set_num_threads", lambda threads: None)  # this process goes on
+def test_solving_is_timed_and_its_memory_is_measured(monkeypatch):
+    monkeypatch.setattr(speed_solve.torch, "set_num_threads", lambda threads: None)  # this process is kept as it is
     before = speed_solve.peak_memory()
-    found = speed_solve.measure(speed_solve.Plan(30, 2, "greedy"), threads=1, repeats=2)
-    assert found.first > 0 and found.later > 0
-    assert 10 * 2**20 < before <= found.before <= found.peak == speed_solve.peak_memory() < 100 * 2**30
+    cost = speed_solve.measure(speed_solve.Case(30, 2, "greedy"), threads=1, repeats=2)
+    assert cost.first > 0 and cost.later > 0
+    assert 10 * 2**20 < before <= cost.memory_before <= cost.memory == speed_solve.peak_memory() < 100 * 2**30
 
 
 def test_every_speed_is_measured():
@@ -199,15 +205,15 @@ def test_every_speed_is_measured():
     assert rate > 0 and flops > 50 * 50 * 2 * 8 * 8  # at least one 8 x 8 product for each node and decision
     assert speed.aec_decisions(5, 2, 0.01) > 0
     assert speed.batched_decisions(3, "cpu", 0.01) > 0
-    assert speed.matmul_rate("cpu") > 0
-    assert "torch" in speed.machine()
+    assert timing.matmul_rate("cpu") > 0
+    assert "torch" in timing.machine_title()
     with pytest.raises(ValueError, match="no device 'tpu' here"):
-        speed.main("tpu")
+        speed.main(device="tpu")
 
 
 def test_the_speed_of_training_counts_what_is_done():
-    """FLOP per decision are the network's, whatever the time: an imitated or reinforced decision is played or shown
-    forwards once and learnt backwards at twice the cost."""
+    """FLOP per decision are the network's, whatever the time: a decision that is learnt from takes one forward pass and
+    a backward pass of twice the cost; REINFORCE plays it too."""
     size = {"n_nodes": (6, 6), "n_agents": (2, 2), "nodes_per_agent": 1, "device": "cpu", "precision": "float32"}
     tiny = {**size, "network": DANConfig(embed_dim=16, feedforward_dim=16, n_heads=2), "validation_instances": 2}
     _, played, forward = speed_train.rollouts(tiny, 8, 0.01)
@@ -217,3 +223,56 @@ def test_the_speed_of_training_counts_what_is_done():
     assert instances > 0 and shown / instances == pytest.approx(6 - 1 + 2)
     assert 2.5 < (flops / shown) / (forward / played) < 3.5
     assert speed_train.teaching(6, 2, 0.01) > 0
+
+
+def test_peers_are_measured_in_turns_and_compared(monkeypatch, tmp_path):
+    """A peer of which every step takes 100 s is slower than we are."""
+    calls = []
+
+    def measure_rl4co(python, batch, seconds):
+        calls.append(batch)
+        return {"rl4co": "0.7.0"}, speed_peers.Timings([[100.0, 100.0]], [[200.0, 200.0]], [batch])
+
+    monkeypatch.setattr(speed_peers, "measure_rl4co", measure_rl4co)
+    monkeypatch.setattr(speed_peers, "BATCHES", (2, 3))
+    threads = torch.get_num_threads()
+    table = speed_peers.speed_table(0.0, 2, Path(sys.executable), compiled=False)
+    assert calls == [2, 3, 2, 3] and torch.get_num_threads() == threads
+    columns = [list(column.cells) for column in table.columns]
+    assert columns[0] == ["RL4CO MTSPEnv", "BatchedMTSP"] * 2 and columns[1] == ["2", "2", "3", "3"]
+    assert columns[2][::2] == ["100000.000"] * 2 and columns[4] == ["1.00", "0.00"] * 2
+    assert all(float(ratio) > 10 for ratio in columns[8][1::2])
+
+
+def test_interrupted_steps_do_not_count():
+    episodes = [[1.0, 9.0, 3.0], [9.0, 2.0, 9.0]]
+    assert speed_peers.best(episodes) == 2.0 and speed_peers.typical(episodes) == 6.0
+    timings = speed_peers.Timings(episodes, episodes, [12, 12])
+    timings.extend(speed_peers.Timings([], [[1.0, 1.0, 1.0]], [12]))
+    assert timings.decisions_per_second == 4.0
+
+
+def test_a_missing_peer_is_an_error_with_instructions(tmp_path, capsys):
+    assert main(["speed", "--peers", "--peer-python", str(tmp_path / "python")]) == 2
+    assert f"{tmp_path / 'python'} does not exist" in (error := capsys.readouterr().err)
+    assert "peers/README.md" in error and error.count("\n") == 1
+    (tmp_path / "python").write_text("#!/bin/sh\necho no module named rl4co >&2\nexit 1\n")
+    (tmp_path / "python").chmod(0o755)
+    with pytest.raises(OSError, match="no module named rl4co"):
+        speed_peers.measure_rl4co(tmp_path / "python", 2, 0.1)
+
+
+# Commands
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_says_what_it_does_and_explains_its_options(name, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main([name, "--help"])
+    assert stopped.value.code == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert f"usage: python -m benchmarks {name}" in text
+    assert load(name).__doc__.split("\n")[0][:40] in text
+    options = re.findall(r" --([a-z][a-z-]*[a-z])", text)
+    documented = re.findall(r"^        (\w+): ", load(name).__doc__, flags=re.MULTILINE)
+    assert {option.removeprefix("no-").replace("-", "_") for option in options} <= {*documented, "help"}

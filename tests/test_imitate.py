@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from helpers.states import same
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from states import same
 
 from dan_policy import DAN, DANConfig, load, save
 from dan_policy.episode import rollout

@@ -36,6 +36,7 @@ FORBIDDEN = {
     "dan_policy/dan.py": ["mtsp_env*"],
     "dan_policy/layers.py": ["mtsp_env*"],
     "dan_policy/actor.py": ["mtsp_env*"],
+    "benchmarks/peers/rl4co_speed.py": ["mtsp_env*", "dan_policy*", "train*", "benchmarks*"],
 }
 NEEDS_AN_EXTRA = {"torch", "tensordict", "torchrl", "numba", "matplotlib", "vrplib"}
 LIGHT = [
@@ -83,6 +84,46 @@ def test_arrows_point_down(file: str) -> None:
     above = PACKAGES[PACKAGES.index(file.partition("/")[0]) + 1 :]
     wrong = [name for name, _ in imports_of(file) if name.partition(".")[0] in (*above, "tests", "examples")]
     assert not wrong
+
+
+def cycles(graph: dict[str, set[str]]) -> list[list[str]]:
+    """The strongly connected components of more than one module."""
+    order: list[str] = []
+    seen: set[str] = set()
+
+    def visit(module: str, edges: dict[str, set[str]], component: list[str]) -> None:
+        seen.add(module)
+        for other in sorted(edges[module]):
+            if other not in seen:
+                visit(other, edges, component)
+        component.append(module)
+
+    for module in graph:
+        if module not in seen:
+            visit(module, graph, order)
+    reverse = {module: {other for other in graph if module in graph[other]} for module in graph}
+    seen.clear()
+    components = []
+    for module in reversed(order):
+        if module not in seen:
+            components.append([])
+            visit(module, reverse, components[-1])
+    return [sorted(component) for component in components if len(component) > 1]
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_modules_do_not_import_each_other_in_circles(package: str) -> None:
+    """Imports within functions and for type checkers count too."""
+    names = {file: file.removesuffix(".py").removesuffix("/__init__").replace("/", ".") for file in FILES}
+    files = [file for file in FILES if file.partition("/")[0] == package and not file.endswith("__init__.py")]
+    modules = {names[file] for file in files}
+    graph = {names[file]: {name for name, _ in imports_of(file) if name in modules - {names[file]}} for file in files}
+    assert not cycles(graph)
+
+
+def test_cycles_are_recognised() -> None:
+    assert cycles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}}) == [["b", "c"]]
+    assert cycles({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
 
 
 @pytest.mark.parametrize("file", FORBIDDEN)

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import ablations, best, curves
+from benchmarks import best_known
 from benchmarks.policies import nearest
+from benchmarks.studies import ablations, curves
 from benchmarks.suite import SEED, Cell
 from train.config import ImitateConfig
 from train.presets import QUICK, REFINE
@@ -26,9 +27,9 @@ def small(monkeypatch):
     monkeypatch.setattr(ablations, "SIZES", {"n_nodes": (6, 8), "n_agents": (2, 2), "nodes_per_agent": 2})
     monkeypatch.setattr(ablations, "ImitateConfig", partial(ImitateConfig, set_tokens=64, buffer=4))
     monkeypatch.setattr(ablations, "REFINE", replace(REFINE, batch_size=2, samples=2))
-    monkeypatch.setitem(curves.SIZE, "n_nodes", (6, 6))
-    monkeypatch.setitem(curves.SIZE, "n_agents", (2, 2))
-    monkeypatch.setitem(curves.SIZE, "validation_instances", 8)
+    monkeypatch.setitem(curves.SETTING, "n_nodes", (6, 6))
+    monkeypatch.setitem(curves.SETTING, "n_agents", (2, 2))
+    monkeypatch.setitem(curves.SETTING, "validation_instances", 8)
 
 
 def test_gaps_are_to_the_best_known_tours():
@@ -37,7 +38,7 @@ def test_gaps_are_to_the_best_known_tours():
             return nearest.nearest(cities, agents, visited)
 
     gaps = {decode: ablations.gaps(Nearest(), CELL, decode) for decode in ("greedy", "sample")}
-    known = best.read(CELL, SEED)
+    known = best_known.read(CELL, SEED)
     assert len(known) == len(gaps["greedy"]) == 3
     assert all(gap > 0.05 for gap in gaps["greedy"])
     assert all(gap > -1e-6 for gap in gaps["sample"])
@@ -47,16 +48,16 @@ def test_gaps_are_to_the_best_known_tours():
     ("variant", "stages"),
     [
         (ablations.Variant("both", network={"city_layers": 1, "agent_layers": 0}), (True, True)),
-        (ablations.Variant("taught", warm=1.0, network={"city_layers": 1}), (True, False)),
-        (ablations.Variant("alone", warm=0.0, network={"city_layers": 1}), (False, True)),
+        (ablations.Variant("taught", imitation=1.0, network={"city_layers": 1}), (True, False)),
+        (ablations.Variant("alone", imitation=0.0, network={"city_layers": 1}), (False, True)),
         (
-            ablations.Variant("other", warm=0.0, policy="benchmarks.policies.attention_model:AttentionModel"),
+            ablations.Variant("other", imitation=0.0, policy="benchmarks.policies.attention_model:AttentionModel"),
             (False, True),
         ),
     ],
 )
 def test_a_variant_is_trained_in_its_stages(small, tmp_path, variant, stages):
-    found = ablations.train_and_judge(variant, 1.0, 0, tmp_path)
+    found = ablations.train_and_evaluate(variant, 1.0, 0, tmp_path)
     assert (found["imitation_steps"] > 0, found["reinforce_steps"] > 0) == stages
     assert len(found["gaps"]["50x5"]["greedy"]) == len(found["gaps"]["50x5"]["sample"]) == 3
     assert found["seconds"] > 0
@@ -76,7 +77,7 @@ def test_verdicts_are_kept_and_not_mixed(tmp_path, monkeypatch, capsys):
     both = "| 20.0 ± 10.0 | 2.0 ± 1.0 "
     assert f"| imitation alone {3 * both}| 2.0 | 1,234 | 7 | 1,000 |" in table.splitlines()
     assert "python -m benchmarks ablations --minutes 2`" in table
-    with pytest.raises(ValueError, match="is of another run"):
+    with pytest.raises(ValueError, match="belongs to another run"):
         ablations.main(3.0, tmp_path, 0, tmp_path / "table.md")
     assert not (tmp_path / "table.md").exists()
 

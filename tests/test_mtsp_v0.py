@@ -13,7 +13,7 @@ import numpy as np
 import pettingzoo
 import pytest
 import torch
-from games import over, play, random_action
+from helpers.games import over, play, random_action
 from pettingzoo.test import api_test, render_test, seed_test
 from pettingzoo.test.state_test import test_state as check_state
 from pettingzoo.test.state_test import test_state_space as check_state_space

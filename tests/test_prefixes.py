@@ -1,4 +1,4 @@
-"""The reference solver with agents under way: the best completions, and never another beginning."""
+"""The reference solver with agents under way: it finds the best completions and keeps the given beginnings."""
 
 import itertools
 
@@ -20,9 +20,9 @@ points = st.tuples(*[st.integers(0, 3).map(lambda k: k / 3) | st.floats(0, 1)] *
 
 
 @st.composite
-def begun(draw: st.DrawFn, most: int = 12) -> tuple[Instance, Tours, Tours]:
+def teams_under_way(draw: st.DrawFn, max_nodes: int = 12) -> tuple[Instance, Tours, Tours]:
     """An instance, prefixes of its tours, some of them closed, and tours that begin with them."""
-    instance = Instance(draw(st.lists(points, min_size=2, max_size=most)), draw(st.integers(1, 5)))
+    instance = Instance(draw(st.lists(points, min_size=2, max_size=max_nodes)), draw(st.integers(1, 5)))
     tours: Tours = [[0] for _ in range(instance.n_agents)]
     for city in draw(st.permutations(range(1, instance.n_nodes))):
         tours[draw(st.integers(0, instance.n_agents - 1))].append(city)
@@ -31,18 +31,18 @@ def begun(draw: st.DrawFn, most: int = 12) -> tuple[Instance, Tours, Tours]:
     for agent, tour in enumerate(tours):
         if tour == [*prefixes[agent], 0] and draw(st.booleans()):
             prefixes[agent] = tour
-    left = set(range(instance.n_nodes)).difference(*prefixes)
-    if left and all(len(prefix) > 1 and prefix[-1] == 0 for prefix in prefixes):
+    unvisited = set(range(instance.n_nodes)).difference(*prefixes)
+    if unvisited and all(len(prefix) > 1 and prefix[-1] == 0 for prefix in prefixes):
         prefixes[0] = [0]
     return instance, prefixes, tours
 
 
-def completions(instance: Instance, prefixes: Tours) -> float:
-    """The least makespan of all tours that begin so, by trying them."""
-    free = sorted(set(range(1, instance.n_nodes)).difference(*prefixes))
+def least_makespan(instance: Instance, prefixes: Tours) -> float:
+    """The least makespan of all tours that begin with the prefixes, by trying them."""
+    unvisited = sorted(set(range(1, instance.n_nodes)).difference(*prefixes))
     open_agents = [a for a, prefix in enumerate(prefixes) if not (len(prefix) > 1 and prefix[-1] == 0)]
     best = np.inf
-    for order in itertools.permutations(free):
+    for order in itertools.permutations(unvisited):
         for agents in itertools.combinations_with_replacement(open_agents, len(order)):
             tours = [list(prefix) for prefix in prefixes]
             for city, agent in zip(order, agents, strict=True):
@@ -51,36 +51,36 @@ def completions(instance: Instance, prefixes: Tours) -> float:
     return best
 
 
-@given(begun(), st.integers(0, 400), st.booleans())
+@given(teams_under_way(), st.integers(0, 400), st.booleans())
 @settings(max_examples=200, deadline=None)
-def test_tours_begin_with_the_prefixes_and_are_never_made_worse(case, iterations: int, start: bool) -> None:
+def test_tours_begin_with_the_prefixes_and_are_never_made_worse(case: tuple, iterations: int, start: bool) -> None:
     instance, prefixes, tours = case
-    found = improve(instance, tours if start else None, iterations=iterations, prefixes=prefixes)
-    check_tours(instance, found)
-    for prefix, tour in zip(prefixes, found, strict=True):
+    improved = improve(instance, tours if start else None, iterations=iterations, prefixes=prefixes)
+    check_tours(instance, improved)
+    for prefix, tour in zip(prefixes, improved, strict=True):
         assert tour[: len(prefix)] == prefix
-        assert tour == prefix or len(prefix) == 1 or prefix[-1] != 0  # closed ones stay so
+        assert tour == prefix or len(prefix) == 1 or prefix[-1] != 0  # closed tours stay as they are
     if start:
-        assert makespan(instance, found) <= makespan(instance, tours)
+        assert makespan(instance, improved) <= makespan(instance, tours)
 
 
-@given(begun(most=7))
+@given(teams_under_way(max_nodes=7))
 @settings(max_examples=60, deadline=None)
-def test_small_teams_are_completed_as_well_as_can_be(case) -> None:
+def test_small_instances_are_completed_optimally(case: tuple) -> None:
     instance, prefixes, _ = case
-    found = improve(instance, iterations=2000, prefixes=prefixes)
-    assert makespan(instance, found) == pytest.approx(completions(instance, prefixes), abs=1e-9)
+    tours = improve(instance, iterations=2000, prefixes=prefixes)
+    assert makespan(instance, tours) == pytest.approx(least_makespan(instance, prefixes), abs=1e-9)
 
 
 @pytest.mark.parametrize("tidy", [False, True])
-def test_without_anything_driven_prefixes_change_nothing(tidy: bool) -> None:
+def test_prefixes_of_agents_at_the_depot_change_nothing(tidy: bool) -> None:
     nodes = np.random.default_rng(0).random((3, 30, 2))
-    free = improve_batch(nodes, 4, 500, tidy=tidy)
-    assert improve_batch(nodes, 4, 500, tidy=tidy, prefixes=[[[0]] * 4] * 3) == free
+    without = improve_batch(nodes, 4, 500, tidy=tidy)
+    assert improve_batch(nodes, 4, 500, tidy=tidy, prefixes=[[[0]] * 4] * 3) == without
 
 
-def test_a_plan_is_still_near_optimal_when_its_beginning_is_fixed() -> None:
-    """n = 60, m = 4: the first third of near-optimal tours as prefixes, and the rest is found again within 1 %."""
+def test_a_plan_with_a_fixed_beginning_is_completed_near_optimally() -> None:
+    """n = 60, m = 4: with the first third of near-optimal tours as prefixes, the makespan is within 1 % of theirs."""
     instance = Instance(np.random.default_rng(1).random((60, 2)), 4)
     plan = improve(instance, iterations=30_000)
     prefixes = [tour[: len(tour) // 3] for tour in plan]
@@ -90,8 +90,8 @@ def test_a_plan_is_still_near_optimal_when_its_beginning_is_fixed() -> None:
         improve(instance, plan, prefixes=[list(reversed(plan[0]))[:3], *prefixes[1:]])
 
 
-def test_games_are_finished_from_any_moment() -> None:
-    """Prefixes are what ``rules.tours`` tells of a game that is not over."""
+def test_games_can_be_completed_from_any_decision() -> None:
+    """The open tours of a game, ``rules.tours(..., close=False)``, are valid prefixes."""
     env = BatchedMTSP(12, 3, [16], 0.1, depot="final", seed=0)
     torch.manual_seed(0)
     td = env.reset()
@@ -99,10 +99,10 @@ def test_games_are_finished_from_any_moment() -> None:
     for _ in range(14):
         states = zip(td["game", "visits"].numpy(), td["game", "destination"].numpy(), strict=True)
         prefixes = [rules.tours(*state, close=False) for state in states]
-        found = improve_batch(nodes, 3, 100, prefixes=prefixes)
-        for row, tours, begun_ in zip(nodes, found, prefixes, strict=True):
+        completed = improve_batch(nodes, 3, 100, prefixes=prefixes)
+        for row, tours, open_tours in zip(nodes, completed, prefixes, strict=True):
             check_tours(Instance(row, 3), tours)
-            assert all(tour[: len(prefix)] == prefix for tour, prefix in zip(tours, begun_, strict=True))
+            assert all(tour[: len(prefix)] == prefix for tour, prefix in zip(tours, open_tours, strict=True))
         td = env.step(env.rand_action(td))["next"]
     driven = path_lengths(nodes[0], prefixes[0])
     assert (driven > 0).all()
@@ -116,11 +116,11 @@ def test_games_are_finished_from_any_moment() -> None:
         ([[0], [3]], r"prefix 1 must begin at the depot 0, got \[3\]"),
         ([[0], [0, 7]], r"prefix 1 visits node 7, outside 0\.\.6"),
         ([[0, 2], [0, 2]], "city 2 is in the prefixes more than once"),
-        ([[0, 2, 0, 3], [0]], r"prefix 0 must not pass the depot in between, got \[0, 2, 0, 3\]"),
+        ([[0, 2, 0, 3], [0]], r"prefix 0 must not pass the depot in the middle, got \[0, 2, 0, 3\]"),
         ([[0, 2, 0], [0, 3, 0]], "all agents are home for good, and 4 cities are left"),
     ],
 )
-def test_bad_prefixes_are_named(square: Instance, prefixes: list, message: str) -> None:
+def test_invalid_prefixes_are_refused(square: Instance, prefixes: list, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         improve(square, prefixes=prefixes)
     with pytest.raises(ValueError, match=message):

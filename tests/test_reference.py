@@ -1,4 +1,4 @@
-"""The reference solver: optimal on small instances, never worse than what it is given, the same for the same seed."""
+"""The reference solver: optimal on small instances, never worse than given tours, reproducible from its seed."""
 
 import copy
 import itertools
@@ -20,7 +20,7 @@ from mtsp_env.tours import path_lengths
 pytest.importorskip("numba", reason="needs the extra reference")
 from mtsp_env.reference import improve, improve_batch, sisr, solver
 from mtsp_env.reference import search as search_arrays
-from mtsp_env.reference.solver import COLD, HOT
+from mtsp_env.reference.solver import END_TEMPERATURE, START_TEMPERATURE
 
 ROOT = Path(__file__).parents[1]
 
@@ -30,7 +30,7 @@ def random_instance(seed: int, n_nodes: int, n_agents: int) -> Instance:
 
 
 def optimum(instance: Instance) -> float:
-    """The best makespan: the shortest tour of every set of cities by trying all orders, then the best partition."""
+    """The least makespan: tries all orders of every set of cities, then all partitions into one set per agent."""
     nodes, n = instance.nodes, instance.n_nodes
     distance = np.linalg.norm(nodes[:, None] - nodes, axis=2)  # (n, n)
     shortest = np.zeros(2 ** (n - 1))  # of each set of cities: bit c - 1 stands for city c
@@ -39,19 +39,19 @@ def optimum(instance: Instance) -> float:
         orders = np.array(list(itertools.permutations(cities)))
         tours = np.pad(orders, ((0, 0), (1, 1)))
         shortest[chosen] = distance[tours[:, :-1], tours[:, 1:]].sum(axis=1).min()
-    best = shortest  # with one agent; then with one more, who takes any part of the cities
+    best = shortest  # with one agent; each further agent takes any part of the cities
     for _ in range(instance.n_agents - 1):
         best = [min(max(shortest[p], best[s - p]) for p in range(s + 1) if p & s == p) for s in range(len(shortest))]
     return best[-1]
 
 
-def inserted_greedily(instance: Instance) -> Tours:
-    """The farthest city first, each where its tour stays shortest."""
+def greedy_insertion(instance: Instance) -> Tours:
+    """Tours by inserting the farthest city first, each city where its tour stays shortest."""
     nodes = instance.nodes
     tours = [[0, 0] for _ in range(instance.n_agents)]
     for city in sorted(range(1, instance.n_nodes), key=lambda city: -math.dist(nodes[0], nodes[city])):
-        ways = [(a, [*tour[:i], city, *tour[i:]]) for a, tour in enumerate(tours) for i in range(1, len(tour))]
-        agent, tour = min(ways, key=lambda way: path_lengths(nodes, [way[1]])[0])
+        options = [(a, [*tour[:i], city, *tour[i:]]) for a, tour in enumerate(tours) for i in range(1, len(tour))]
+        agent, tour = min(options, key=lambda option: path_lengths(nodes, [option[1]])[0])
         tours[agent] = tour
     return tours
 
@@ -62,7 +62,7 @@ instances = st.builds(Instance, st.lists(points, min_size=2, max_size=14), st.in
 
 @st.composite
 def instances_and_tours(draw: st.DrawFn) -> tuple[Instance, Tours]:
-    """Any tours that solve the instance, which may pass the depot in between or stay at home."""
+    """An instance and tours that solve it. They may pass the depot in the middle, and agents may stay at home."""
     instance = draw(instances)
     tours = [[0] for _ in range(instance.n_agents)]
     for city in draw(st.permutations(range(1, instance.n_nodes))):
@@ -72,16 +72,16 @@ def instances_and_tours(draw: st.DrawFn) -> tuple[Instance, Tours]:
 
 @pytest.fixture
 def turns(monkeypatch) -> list[tuple[int, float, float]]:
-    """The calls of the annealing kernel: iterations, first and last temperature. Each iteration takes 0.1 ms."""
+    """Calls of the annealing kernel (iterations, first and last temperature); the clock gives each iteration 0.1 ms."""
     calls, anneal = [], sisr.anneal
     solver.compile_kernels()
 
-    def noted(search, iterations, hot, cold, *goal):
+    def recorded(search, iterations, hot, cold, *goal):
         calls.append((iterations, hot, cold))
         return anneal(search, iterations, hot, cold, *goal)
 
     clock = SimpleNamespace(perf_counter=lambda: 5.0 + 1e-4 * sum(iterations for iterations, _, _ in calls))
-    monkeypatch.setattr(sisr, "anneal", noted)
+    monkeypatch.setattr(sisr, "anneal", recorded)
     monkeypatch.setattr(solver, "time", clock)
     return calls
 
@@ -104,8 +104,8 @@ def test_small_instances_are_solved_to_the_optimum(n_nodes: int, n_agents: int) 
         assert makespan(instance, improve(instance, iterations=1000)) == pytest.approx(optimum(instance), abs=1e-9)
 
 
-def test_a_few_milliseconds_are_nearly_enough() -> None:
-    """n = 50, m = 5: 2000 iterations stay within 1 % of 20,000, on average; greedy insertion does not within 15 %."""
+def test_a_few_milliseconds_give_near_optimal_tours() -> None:
+    """n = 50, m = 5: on average 2000 iterations are within 1 % of 20,000; greedy insertion is more than 15 % off."""
     nodes = np.random.default_rng(0).random((12, 50, 2))
     start, short, long = (
         np.mean(
@@ -118,7 +118,7 @@ def test_a_few_milliseconds_are_nearly_enough() -> None:
 
 
 def test_a_travelling_salesman_goes_round_a_circle() -> None:
-    """One agent: points of a circle are best visited in their order."""
+    """One agent: points on a circle are best visited in their order around it."""
     angles = np.random.default_rng(1).random(40) * 2 * math.pi
     nodes = 0.5 + 0.5 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     tour = improve(Instance(nodes, n_agents=1))[0]
@@ -127,14 +127,14 @@ def test_a_travelling_salesman_goes_round_a_circle() -> None:
     assert tour in (ring, ring[::-1])
 
 
-def test_no_iterations_leave_greedy_insertion() -> None:
+def test_without_iterations_the_result_is_greedy_insertion() -> None:
     for seed, (n_nodes, n_agents) in enumerate([(2, 1), (9, 3), (30, 4), (12, 20)]):
         instance = random_instance(seed, n_nodes, n_agents)
-        found, expected = improve(instance, iterations=0), inserted_greedily(instance)
-        assert [min(tour, tour[::-1]) for tour in found] == [min(tour, tour[::-1]) for tour in expected]
+        tours, expected = improve(instance, iterations=0), greedy_insertion(instance)
+        assert [min(tour, tour[::-1]) for tour in tours] == [min(tour, tour[::-1]) for tour in expected]
 
 
-# What holds for any instance
+# Any instance
 
 
 @settings(max_examples=60, deadline=None)
@@ -157,18 +157,17 @@ def test_given_tours_are_never_made_worse(problem: tuple[Instance, Tours], itera
     assert tours == before
 
 
-def test_optimal_tours_come_back_as_they_are(square: Instance, square_tours: Tours) -> None:
+def test_optimal_tours_are_returned_as_a_copy(square: Instance, square_tours: Tours) -> None:
     improved = improve(square, square_tours, iterations=100)
     assert improved == square_tours
     improved[0].reverse()
-    assert improved != square_tours  # a copy
+    assert improved != square_tours
 
-    idle_first = [[0, 0], [0, 2, 0, 1, 0]]  # and by way of the depot, where the cities lie
+    idle_first = [[0, 0], [0, 2, 0, 1, 0]]  # passes the depot, where all cities are
     assert improve(Instance([[0.5, 0.5]] * 3, n_agents=2), idle_first, iterations=100) == idle_first
 
 
-def test_the_search_starts_from_the_given_tours_or_greedy_insertion(monkeypatch) -> None:
-    """From the better of the two."""
+def test_the_search_starts_from_the_better_of_the_given_tours_and_greedy_insertion(monkeypatch) -> None:
     instance, starts = random_instance(3, 60, 3), []
     good, greedy = improve(instance, iterations=1000), improve(instance, iterations=0)
     bad = [[0, *range(1, 60), 0], [0, 0], [0, 0]]
@@ -177,43 +176,43 @@ def test_the_search_starts_from_the_given_tours_or_greedy_insertion(monkeypatch)
     assert improve(instance, bad) == greedy
     expected = [makespan(instance, good), makespan(instance, greedy)]
     assert expected[0] < expected[1]
-    assert starts == pytest.approx(np.repeat(expected, 4).tolist())  # at the beginning of each round
+    assert starts == pytest.approx(np.repeat(expected, 4).tolist())  # in each of the four rounds
 
 
 @pytest.mark.parametrize("nodes", [[[0.25, 0.5]] * 5, [[0.0, 0.0], *[[1.0, 1.0]] * 6]], ids=["one place", "two places"])
 @pytest.mark.parametrize("n_agents", [1, 3, 9])
 def test_coincident_cities(nodes: list, n_agents: int) -> None:
-    """All cities in one place: the first agent there can visit all of them, which is optimal."""
+    """If all cities are in one place, one agent can visit all of them at no extra cost, so one trip is optimal."""
     instance = Instance(nodes, n_agents)
     assert makespan(instance, improve(instance, iterations=10)) == 2 * math.dist(*nodes[:2])
 
 
-# When it ends
+# The end of a search
 
 
 @pytest.mark.parametrize("limit", [{"iterations": 10**15}, {"seconds": 1e9}, {"iterations": 10**15, "seconds": 1e9}])
 def test_the_search_ends_at_the_lower_bound(limit: dict) -> None:
-    """It would not end otherwise; with 20 agents the farthest city alone makes the makespan."""
+    """Without this rule it would not end here. With 20 agents the farthest city alone sets the makespan."""
     instance = random_instance(0, 60, 20)
     assert makespan(instance, improve(instance, iterations=0)) > lower_bound(instance) + 1e-3
     assert makespan(instance, improve(instance, **limit)) <= lower_bound(instance) + 1e-9
 
 
 @pytest.mark.parametrize(("given", "total"), [(150, 150), (15, 15), (7, 7), (None, 500 * 40)])
-def test_iterations_cool_down_four_times(turns: list, given: int | None, total: int) -> None:
-    """Each time twice as long; in units of greedy insertion's makespan times sqrt(m / n)."""
+def test_iterations_are_divided_into_four_rounds(turns: list, given: int | None, total: int) -> None:
+    """Each round is twice as long as the one before. Unit of temperature: greedy makespan times sqrt(m / n)."""
     instance = random_instance(5, 40, 3)
-    unit = makespan(instance, inserted_greedily(instance)) * math.sqrt(3 / 40)
+    unit = makespan(instance, greedy_insertion(instance)) * math.sqrt(3 / 40)
     improve(instance, iterations=given)
     iterations, hot, cold = np.array(turns).T
     assert np.cumsum(iterations).tolist() == [math.ceil(total * part / 15) for part in (1, 3, 7, 15)]
-    if total % 15 == 0:  # else a round ends within an iteration
-        assert hot == pytest.approx(HOT * unit)
-    assert cold == pytest.approx(COLD * unit)
+    if total % 15 == 0:  # otherwise a round ends within an iteration
+        assert hot == pytest.approx(START_TEMPERATURE * unit)
+    assert cold == pytest.approx(END_TEMPERATURE * unit)
 
 
-def test_seconds_cool_down_by_the_clock(turns: list) -> None:
-    """1.5 seconds are over after 15,000 iterations, in turns of a hundredth of them; each goes on where one ended."""
+def test_with_seconds_the_temperature_follows_the_clock(turns: list) -> None:
+    """1.5 s are 15,000 iterations, in turns of a hundredth; each turn starts at the last one's temperature."""
     improve(random_instance(5, 40, 3), seconds=1.5)
     iterations, hot, cold = np.array(turns).T
     assert iterations.sum() == pytest.approx(15000, rel=1e-3)
@@ -224,47 +223,46 @@ def test_seconds_cool_down_by_the_clock(turns: list) -> None:
     within = (over - ends[of_round]) / np.diff(ends)[of_round]
     inside = (over[1:-1] - ends[of_round[1:-1]] > 0.01) & (within[1:-1] < 0.99)  # not at the end of a round
     assert inside.sum() > 80
-    assert cold[1:-1][inside] / hot[0] == pytest.approx((COLD / HOT) ** within[1:-1][inside])
+    assert cold[1:-1][inside] / hot[0] == pytest.approx((END_TEMPERATURE / START_TEMPERATURE) ** within[1:-1][inside])
     assert hot[2:][inside] == pytest.approx(cold[1:-1][inside])
 
 
 @pytest.mark.parametrize(("seconds", "iterations", "done"), [(1e9, 1234, 1234), (0.1, 10**15, 1000)])
-def test_the_first_limit_counts(turns: list, seconds: float, iterations: int, done: int) -> None:
+def test_the_limit_reached_first_ends_the_search(turns: list, seconds: float, iterations: int, done: int) -> None:
     improve(random_instance(5, 40, 3), seconds=seconds, iterations=iterations)
     assert done <= sum(turn for turn, _, _ in turns) <= min(done * 1.02, iterations)
 
 
-# Same seed, same tours
+# Seeds and batches
 
 
-def test_the_seed_decides() -> None:
+def test_the_seed_determines_the_tours() -> None:
     instance = random_instance(6, 60, 4)
     one, again, other = (improve(instance, iterations=300, seed=seed) for seed in (7, 7, 8))
     assert one == again != other
 
 
 @pytest.mark.parametrize("threads", [None, 1, 2, 5])
-def test_a_batch_is_its_rows(threads: int | None) -> None:
+def test_a_batch_gives_the_same_tours_as_its_rows(threads: int | None) -> None:
     nodes = np.random.default_rng(8).random((7, 30, 2))
     rows = [improve(Instance(row, 3), iterations=200, seed=9) for row in nodes]
     assert improve_batch(nodes, 3, iterations=200, seed=9, threads=threads) == rows
 
 
-def test_tidy_tours_are_shorter_where_it_does_not_show() -> None:
-    """With 12 agents the farthest city makes the makespan: the others' tours may be as long as that, or tidy."""
+def test_tidy_tours_are_shorter_in_total() -> None:
+    """With 12 agents the farthest city sets the makespan: the other tours can be shorter at no cost."""
     nodes = np.random.default_rng(3).random((6, 40, 2))
     for row, loose, tidy in zip(
         nodes, *(improve_batch(nodes, 12, 4000, tidy=tidy) for tidy in (False, True)), strict=True
     ):
-        check_tours(Instance(row, 12), tidy)
-        assert makespan(Instance(row, 12), loose) == pytest.approx(
-            lower_bound(Instance(row, 12))
-        )  # which ended that search
-        assert makespan(Instance(row, 12), tidy) <= 1.005 * makespan(Instance(row, 12), loose)
+        instance = Instance(row, 12)
+        check_tours(instance, tidy)
+        assert makespan(instance, loose) == pytest.approx(lower_bound(instance))  # which ended that search
+        assert makespan(instance, tidy) <= 1.005 * makespan(instance, loose)
         assert path_lengths(row, tidy).sum() < 0.9 * path_lengths(row, loose).sum()
 
 
-def test_batches_of_other_kinds() -> None:
+def test_empty_float32_and_strided_batches() -> None:
     nodes = np.random.default_rng(8).random((2, 6, 2), dtype=np.float32)
     assert improve_batch(nodes[:0], 3) == []
     assert improve_batch(nodes[:, :, ::-1][::-1], 9, iterations=50) == [
@@ -289,8 +287,8 @@ def test_nearest_cities(n: int, k: int) -> None:
 @pytest.mark.parametrize("weight", [0.0, 0.5])
 @pytest.mark.parametrize("hot", [1e-9, 1.0], ids=["cold", "hot"])
 @pytest.mark.parametrize(("n", "m"), [(2, 1), (3, 1), (4, 3), (8, 2), (30, 1), (60, 5), (40, 30)])
-def test_lengths_are_kept_as_the_judge_finds_them(n: int, m: int, hot: float, weight: float) -> None:
-    """After many iterations, accepted (hot) or undone (cold), without summing afresh; a cold objective never grows."""
+def test_lengths_are_kept_up_to_date(n: int, m: int, hot: float, weight: float) -> None:
+    """They equal the judge's after many iterations, accepted (hot) or undone (cold). A cold objective never grows."""
 
     def score(tours: Tours) -> float:
         lengths = tour_lengths(instance, tours)
@@ -316,7 +314,7 @@ def test_lengths_are_kept_as_the_judge_finds_them(n: int, m: int, hot: float, we
 
 
 def test_tours_are_loaded_as_given() -> None:
-    """But for idle agents, who come last, and for depots in between, which are left out; whatever was there before."""
+    """Except that idle agents come last and visits to the depot in the middle are left out. Old tours are replaced."""
     search = search_arrays.new_search(np.random.default_rng(0).random((6, 2)), 4, seed=0)
     sisr.insert_greedily(search, np.arange(1, 6))
     tours = [[0, 0], [0, 3, 0, 0, 1, 0], [0, 0], [0, 5, 2, 4, 0]]
@@ -329,16 +327,16 @@ def test_tours_are_loaded_as_given() -> None:
 
 def test_rounds_begin_with_the_best_tours(monkeypatch) -> None:
     anneal = sisr.anneal
-    found = []
+    bests = []
 
     def checked(search, iterations, hot, cold, best, *goal):
-        found.append(best)
+        bests.append(best)
         assert sisr.sum_lengths(search) == pytest.approx(best)
-        return anneal(search, iterations, hot, hot, best, *goal)  # which leaves it far from the best
+        return anneal(search, iterations, hot, hot, best, *goal)  # always hot: ends far from the best tours
 
     monkeypatch.setattr(sisr, "anneal", checked)
     improve(random_instance(11, 50, 4), iterations=1500)
-    assert len(found) == 4 and found[0] > found[-1]
+    assert len(bests) == 4 and bests[0] > bests[-1]
 
 
 # Bad input

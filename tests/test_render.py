@@ -1,4 +1,4 @@
-"""Pictures: what is drawn where, files, windows that are not there."""
+"""Pictures: what is drawn, picture files, and windows on a machine without a display."""
 
 import itertools
 import os
@@ -46,7 +46,7 @@ def test_finished_tours(square: Instance, square_tours: list[list[int]]) -> None
 
 
 def test_tours_so_far(square: Instance) -> None:
-    """No return leg, a ring where the agent heads for, cities hollow that nobody has picked yet."""
+    """An open tour has no return leg and a ring at its agent's destination; unvisited cities are hollow."""
     ax = draw_tours(square, [[0, 2, 1], [0]])
     assert drawn_line(ax, 0) == [[0.5, 0.5], [0.5, 1.0], [0.0, 1.0]]
     assert drawn_line(ax, 1) == [[0.5, 0.5]]
@@ -58,7 +58,7 @@ def test_tours_so_far(square: Instance) -> None:
     assert ax.get_title() == "square: 2 of 6 cities, longest tour so far 1.000"
 
 
-def test_lengths_are_in_the_units_of_the_instance_and_the_longest_stands_out() -> None:
+def test_lengths_have_the_units_of_the_instance_and_the_longest_is_bold() -> None:
     instance = Instance([[0.0, 0.0], [0.5, 0.0], [1.0, 0.0]], 3, "road", scale=2000.0)
     ax = draw_tours(instance, [[0, 1, 0], [0, 2, 0], [0, 0]])
     assert legend(ax) == ["agent 0:  2,000", "agent 1:  4,000  longest", "agent 2:  0"]
@@ -77,9 +77,11 @@ def test_with_many_agents_the_longest_tours_are_listed() -> None:
         assert handle.get_linestyle() == ("-" if agent < 20 else "--")
 
 
-def test_twenty_colours_differ_for_the_colour_blind_too() -> None:
-    """CIE76 distances of at least 15 (2 is noticeable) under normal vision, and under full deuteranopia and protanopia
-    as simulated by Machado et al. 2009."""
+def test_twenty_colours_differ_for_colour_blind_people_too() -> None:
+    """CIE76 distances are above 15 (2 is noticeable) under normal vision, deuteranopia and protanopia.
+
+    Source of the two matrices: Machado et al. 2009, severity 1.
+    """
     deuteranopia = [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
     protanopia = [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
     to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
@@ -94,7 +96,7 @@ def test_twenty_colours_differ_for_the_colour_blind_too() -> None:
 
 
 @pytest.mark.parametrize(
-    ("lengths", "written"),
+    ("lengths", "expected"),
     [
         ([2.0, 0.9], ["2.000", "0.900"]),
         ([5677.31, 999.6], ["5,677", "1,000"]),
@@ -104,11 +106,11 @@ def test_twenty_colours_differ_for_the_colour_blind_too() -> None:
         ([], []),
     ],
 )
-def test_lengths_for_people(lengths: list[float], written: list[str]) -> None:
-    assert format_lengths(lengths) == written
+def test_lengths_are_formatted_alike(lengths: list[float], expected: list[str]) -> None:
+    assert format_lengths(lengths) == expected
 
 
-def test_a_name_is_text_not_mathematics(tmp_path) -> None:
+def test_names_and_titles_are_not_parsed_as_formulas(tmp_path) -> None:
     instance = Instance([[0.0, 0.0], [1.0, 1.0]], 1, name=r"$\broken{$ _x")
     save_picture(tmp_path / "a.svg", instance, [[0, 1, 0]])
     save_picture(tmp_path / "a.svg", instance, [[0, 1, 0]], title=r"$\frac$")
@@ -129,7 +131,7 @@ def test_degenerate_instances_can_be_drawn(tmp_path, nodes: list) -> None:
         ([[0, -1, 0], [0]], r"tour 0 visits node -1, outside 0\.\.6"),
     ],
 )
-def test_what_is_no_tour_is_refused(square: Instance, tours: list, message: str) -> None:
+def test_invalid_tours_are_refused(square: Instance, tours: list, message: str) -> None:
     viewer = Viewer(show=False)
     for draw in (draw_tours, viewer.draw):
         with pytest.raises(ValueError, match=message):
@@ -149,11 +151,11 @@ def test_the_suffix_decides_the_format(tmp_path, square, square_tours, suffix: s
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_the_title_is_mine_where_i_give_one(tmp_path, square, square_tours) -> None:
+def test_a_given_title_replaces_the_default(tmp_path, square, square_tours) -> None:
     with pyplot.rc_context({"svg.fonttype": "none"}):
-        save_picture(tmp_path / "a.svg", square, square_tours, title="mine")
+        save_picture(tmp_path / "a.svg", square, square_tours, title="my title")
     text = (tmp_path / "a.svg").read_text()
-    assert "mine" in text
+    assert "my title" in text
     assert "makespan" not in text
 
 
@@ -169,10 +171,10 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, square, square_tours, monk
     path = tmp_path / "a.png"
     path.write_bytes(b"old")
 
-    def full(*_):
+    def fail(*_):
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(os, "replace", full)
+    monkeypatch.setattr(os, "replace", fail)
     with pytest.raises(OSError, match="no space"):
         save_picture(path, square, square_tours)
     assert path.read_bytes() == b"old"
@@ -184,7 +186,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, square, square_tours, monk
 # The viewer
 
 
-def test_an_array_per_step_and_each_its_own(square: Instance, square_tours: list[list[int]]) -> None:
+def test_each_picture_is_an_array_of_its_own(square: Instance, square_tours: list[list[int]]) -> None:
     viewer = Viewer(show=False)
     start = viewer.draw(square, [[0], [0]])
     kept = start.copy()
@@ -192,7 +194,7 @@ def test_an_array_per_step_and_each_its_own(square: Instance, square_tours: list
     assert (start.shape, start.dtype) == ((600, 800, 3), np.uint8)
     assert np.array_equal(start, kept)
     assert not np.array_equal(start, end)
-    assert np.array_equal(viewer.draw(square, [[0], [0]]), start)  # nothing of the later picture stays behind
+    assert np.array_equal(viewer.draw(square, [[0], [0]]), start)  # nothing of the picture before remains
     viewer.close()
 
 
@@ -202,36 +204,36 @@ def test_a_reused_figure_shows_what_a_fresh_one_would(square: Instance, square_t
     used = Viewer(show=False)
     used.draw(other, tours)
     used.draw(square, [[0, 2], [0, 5]])
-    for instance, drawn in ((square, square_tours), (other, tours), (square, [[0, 1], [0]])):
-        assert np.array_equal(used.draw(instance, drawn), Viewer(show=False).draw(instance, drawn))
+    for instance, shown in ((square, square_tours), (other, tours), (square, [[0, 1], [0]])):
+        assert np.array_equal(used.draw(instance, shown), Viewer(show=False).draw(instance, shown))
 
 
-def test_every_agent_and_city_can_be_seen(square: Instance, square_tours: list[list[int]]) -> None:
+def test_the_colours_of_all_agents_are_visible(square: Instance, square_tours: list[list[int]]) -> None:
     pixels = {tuple(pixel) for pixel in Viewer(show=False).draw(square, square_tours).reshape(-1, 3).tolist()}
     for colour in (*COLOURS[:2], "black", "white"):
         assert tuple(round(255 * channel) for channel in to_rgba(colour)[:3]) in pixels
     assert not {tuple(round(255 * channel) for channel in to_rgba(colour)[:3]) for colour in COLOURS[2:]} & pixels
 
 
-def test_a_window_never_blocks_and_leaves_nothing_behind(square, square_tours, monkeypatch) -> None:
-    monkeypatch.setenv("DISPLAY", ":99")  # where there might be one, matplotlib warns that Agg does not use it
+def test_a_window_never_blocks_and_close_removes_it(square, square_tours, monkeypatch) -> None:
+    monkeypatch.setenv("DISPLAY", ":99")  # with a display, matplotlib would warn that Agg has no windows
     viewer, other = Viewer(show=True), Viewer(show=True)
     before = pyplot.get_fignums()
     for tours in ([[0], [0]], [[0, 2], [0]], square_tours):
         assert viewer.draw(square, tours) is None
     other.draw(square, square_tours)
-    assert len(pyplot.get_fignums()) == len(before) + 2  # a window each, the same one for every picture
+    assert len(pyplot.get_fignums()) == len(before) + 2  # one window per viewer
     viewer.close()
     viewer.close()
     assert len(pyplot.get_fignums()) == len(before) + 1
-    pyplot.close("all")  # by hand, so to speak
+    pyplot.close("all")  # as if the user had closed it
     other.draw(square, square_tours)
     assert len(pyplot.get_fignums()) == 1
     other.close()
     assert pyplot.get_fignums() == []
 
 
-def test_without_a_viewer_pyplot_is_left_alone(tmp_path, square, square_tours) -> None:
+def test_without_a_window_pyplot_has_no_new_figures(tmp_path, square, square_tours) -> None:
     before = pyplot.get_fignums()
     draw_tours(square, square_tours)
     save_picture(tmp_path / "a.png", square, square_tours)
@@ -246,7 +248,7 @@ def test_draws_into_given_axes(square: Instance, square_tours: list[list[int]]) 
     pyplot.close("all")
 
 
-# The environment's pictures, and none at all
+# The environment's pictures, and a machine without matplotlib
 
 
 @pytest.mark.parametrize("mode", ["rgb_array", "human"])
@@ -269,7 +271,7 @@ def test_the_environment_renders_every_step(mode: str) -> None:
     assert pyplot.get_fignums() == []
 
 
-def test_matplotlib_is_imported_to_draw_only() -> None:
+def test_matplotlib_is_imported_only_to_draw() -> None:
     code = "import sys, mtsp_env.render; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 

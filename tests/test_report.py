@@ -1,4 +1,4 @@
-"""The report says what the rows say: statistics by hand, every damage named, every failure told."""
+"""Reports agree with their rows: statistics by hand, every damage and every failure named."""
 
 import gzip
 import json
@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 from made_up import one_agent_does_it_all, row
 
-from benchmarks import best, rows, stats, suite
+from benchmarks import best_known, suite
 from benchmarks.__main__ import main
-from benchmarks.report import report
+from benchmarks.harness import rows
+from benchmarks.reports import statistics
+from benchmarks.reports.markdown import markdown_table
+from benchmarks.reports.report import report
 from mtsp_env import makespan
 
 INSTANCES = suite.cells("smoke")[0].instances(7)
@@ -27,7 +30,7 @@ COSTS = {
 @pytest.fixture(autouse=True)
 def no_kept_tours(tmp_path_factory, monkeypatch):
     """Only the tours of the rows are known."""
-    monkeypatch.setattr(stats.load, "__defaults__", (None, tmp_path_factory.mktemp("best")))
+    monkeypatch.setattr(statistics.load, "__defaults__", (None, tmp_path_factory.mktemp("best")))
 
 
 def measured(method, tours, **more):
@@ -38,8 +41,8 @@ def failed(like, status, error, **more):
     return replace(like, status=status, error=error, tours=None, makespan=None, **more)
 
 
-def write(path, found):
-    text = "".join(json.dumps(asdict(one)) + "\n" for one in found).encode()
+def write(path, results):
+    text = "".join(json.dumps(asdict(row)) + "\n" for row in results).encode()
     path.write_bytes(gzip.compress(text) if path.suffix == ".gz" else text)
     return path
 
@@ -52,9 +55,9 @@ def line_of(text, heading, label):
 
 
 def test_mean_and_standard_error_by_hand():
-    assert stats.mean([1, 2, 3, 6]) == (3.0, pytest.approx(math.sqrt((4 + 1 + 0 + 9) / 3 / 4)), 4)
-    assert stats.mean([2.5]) == (2.5, None, 1)
-    assert stats.mean([]) is None
+    assert statistics.mean([1, 2, 3, 6]) == (3.0, pytest.approx(math.sqrt((4 + 1 + 0 + 9) / 3 / 4)), 4)
+    assert statistics.mean([2.5]) == (2.5, None, 1)
+    assert statistics.mean([]) is None
 
 
 @pytest.mark.parametrize(
@@ -67,10 +70,10 @@ def test_mean_and_standard_error_by_hand():
     ],
 )
 def test_pairs_by_hand(differences, expected):
-    found = stats.compare(np.array(differences, dtype=float))
-    assert (found.wins, found.ties, found.losses) == expected[:3]
-    assert found.p == pytest.approx(expected[3])
-    assert found.difference == pytest.approx(np.mean(differences))
+    comparison = statistics.compare(np.array(differences, dtype=float))
+    assert (comparison.wins, comparison.ties, comparison.losses) == expected[:3]
+    assert comparison.p == pytest.approx(expected[3])
+    assert comparison.difference == pytest.approx(np.mean(differences))
 
 
 def test_gaps_are_to_the_best_of_the_rows_and_the_kept_tours(tmp_path):
@@ -78,15 +81,15 @@ def test_gaps_are_to_the_best_of_the_rows_and_the_kept_tours(tmp_path):
         write(tmp_path / "a.jsonl", measured("one", ALL_BY_ONE)),
         write(tmp_path / "b.jsonl.gz", measured("h", HALVES)),
     ]
-    (results,) = stats.load(files)
+    (results,) = statistics.load(files)
     known = np.minimum(COSTS["one"], COSTS["halves"])
     assert list(results.gaps("one", "8x2").values()) == pytest.approx(np.array(COSTS["one"]) / known - 1)
-    (alone,) = stats.load(files[:1])
+    (alone,) = statistics.load(files[:1])
     assert list(alone.gaps("one", "8x2").values()) == [0, 0, 0]
 
     kept = tmp_path / "kept"
-    best.merge(suite.cells("smoke")[0], 7, {1: HALVES}, kept)
-    (results,) = stats.load(files[:1], None, kept)
+    best_known.merge(suite.cells("smoke")[0], 7, {1: HALVES}, kept)
+    (results,) = statistics.load(files[:1], None, kept)
     assert list(results.gaps("one", "8x2").values()) == pytest.approx([0, COSTS["one"][1] / COSTS["halves"][1] - 1, 0])
     assert (results.unkept, alone.unkept) == (2, 3)
 
@@ -113,7 +116,7 @@ def test_a_report_by_hand(tmp_path):
     assert "Against" not in report([tmp_path / "rows.jsonl"], against="lkh3")
 
 
-def test_failures_are_counted_and_told(tmp_path):
+def test_failures_are_counted_in_notes(tmp_path):
     good, bad = measured("reference", HALVES, budget=1.0), measured("lkh3", HALVES, budget=1.0)
     late = failed(bad[0], "timeout", "killed 10 s after its limit of 1 s")
     gone = [failed(r, "crash", "killed by\n SIGSEGV | core") for r in measured("exact", HALVES, budget=1.0)]
@@ -125,7 +128,7 @@ def test_failures_are_counted_and_told(tmp_path):
     assert "\n2. of 3: 3 × crash: killed by SIGSEGV / core\n" in text
 
 
-def test_a_busy_machine_is_told(tmp_path):
+def test_a_busy_machine_is_mentioned(tmp_path):
     rows = measured("reference", HALVES, budget=1.0)  # a second of wall time each
     alone = [replace(r, cpu_seconds=0.95) for r in rows]
     assert "of a core" not in report([write(tmp_path / "alone.jsonl", alone)])
@@ -136,8 +139,8 @@ def test_a_busy_machine_is_told(tmp_path):
 
 def test_the_later_row_counts(tmp_path):
     first = [failed(r, "error", "no") for r in measured("nearest", HALVES)]
-    (results,) = stats.load([write(tmp_path / "rows.jsonl", first + measured("nearest", ALL_BY_ONE))])
-    assert [r.makespan for r in results.right("nearest", "8x2").values()] == COSTS["one"]
+    (results,) = statistics.load([write(tmp_path / "rows.jsonl", first + measured("nearest", ALL_BY_ONE))])
+    assert [r.makespan for r in results.solved("nearest", "8x2").values()] == COSTS["one"]
 
 
 @pytest.mark.parametrize("name", ["rows.jsonl", "rows.jsonl.gz"])
@@ -163,8 +166,8 @@ def test_a_damaged_line_is_named(tmp_path, name, damage, message, capsys):
     path = tmp_path / name
     path.write_bytes(gzip.compress(text) if path.suffix == ".gz" else text)
     assert main(["report", str(path)]) == 2
-    said = capsys.readouterr().err
-    assert f"{path}:2: " in said and message in said
+    stderr = capsys.readouterr().err
+    assert f"{path}:2: " in stderr and message in stderr
 
 
 def test_other_damage_is_named_too(tmp_path, capsys):
@@ -181,17 +184,17 @@ def test_two_networks_under_one_name_are_refused(tmp_path):
     old = write(tmp_path / "old.jsonl", measured("dan-s64", HALVES, versions={"weights": "aaa"}))
     new = write(tmp_path / "new.jsonl", measured("dan-s64", HALVES, versions={"weights": "bbb"}))
     with pytest.raises(ValueError, match=r"new\.jsonl:1: rows of dan-s64 with weights bbb, in .*old\.jsonl with aaa"):
-        stats.load([old, new])
+        statistics.load([old, new])
 
 
 def test_published_numbers_stand_beside_measured_ones(tmp_path):
-    found = []
+    results = []
     for label in ("50x5", "50x10"):
         cell = replace(suite.find_cell("1", label), count=1)
         tours = one_agent_does_it_all(cell.instances(7)[0])
         for method in ("dan-s64", "ortools", "lkh3"):
-            found.append(row(cell.instances(7)[0], tours, 0, label, "1", method=method))
-    text = report([write(tmp_path / "rows.jsonl", found)])
+            results.append(row(cell.instances(7)[0], tours, 0, label, "1", method=method))
+    text = report([write(tmp_path / "rows.jsonl", results)])
     assert line_of(text, "Makespan", "*OR-Tools, published*") == ["2.04", "1.96"]
     assert line_of(text, "Seconds", "*OR-Tools, published*") == ["12", "12"]
     assert line_of(text, "Makespan", "*LKH3, Kim et al. 2022*") == ["2.00", "1.91"]
@@ -212,29 +215,31 @@ def test_table_3_has_both_lengths_and_names_the_mix_up(tmp_path):
     (cell,) = [cell for cell in suite.cells("3", folder) if cell.n_agents == 10]
     instance = cell.instances(7)[0]
     tours = one_agent_does_it_all(instance)
-    found = row(instance, tours, 0, cell.label, "3", method="dan-s256")
-    found = replace(found, length=found.makespan * instance.scale, rounded_length=suite.rounded_length(instance, tours))
-    path = write(tmp_path / "rows.jsonl", [found])
+    result = row(instance, tours, 0, cell.label, "3", method="dan-s256")
+    result = replace(
+        result, length=result.makespan * instance.scale, rounded_length=suite.rounded_length(instance, tours)
+    )
+    path = write(tmp_path / "rows.jsonl", [result])
     text = report([path])
     assert line_of(text, "Longest tour, every leg", "*DAN s.256, published*") == ["1610"]
-    assert line_of(text, "Longest tour, every leg", "dan-s256") == [str(found.rounded_length)]
-    assert line_of(text, "Longest tour, not rounded", "dan-s256") == [f"{found.length:.1f}"]
+    assert line_of(text, "Longest tour, every leg", "dan-s256") == [str(result.rounded_length)]
+    assert line_of(text, "Longest tour, not rounded", "dan-s256") == [f"{result.length:.1f}"]
     assert "gtsp150, 10 (1)" in text and "under the name kroa150" in text and "For 1 of 1 instances the best" in text
-    write(path, [replace(found, makespan=0.5)])
-    report([path])  # nothing to judge by
+    write(path, [replace(result, makespan=0.5)])
+    report([path])  # without the files nothing is checked
     with pytest.raises(ValueError, match=r"rows\.jsonl:1: its makespan is 0\.5"):
         report([path], tsplib=folder)
 
 
 def test_a_folder_gets_the_tables_and_the_pictures(tmp_path, capsys):
-    found = measured("dan-s64", HALVES) + measured("reference", SWAPPED, budget=1.0) + measured("misc:own", HALVES)
-    found += [replace(r, budget=10.0) for r in found if r.budget]
+    results = measured("dan-s64", HALVES) + measured("reference", SWAPPED, budget=1.0) + measured("misc:own", HALVES)
+    results += [replace(r, budget=10.0) for r in results if r.budget]
     cell = replace(suite.find_cell("figure4", "20x5"), count=1)
     tours = one_agent_does_it_all(cell.instances(7)[0])
-    found += [row(cell.instances(7)[0], tours, 0, "20x5", "figure4", method="dan-greedy")]
-    found += [failed(replace(found[-1], method="ortools-first"), "timeout", "killed", seconds=610.0)]
+    results += [row(cell.instances(7)[0], tours, 0, "20x5", "figure4", method="dan-greedy")]
+    results += [failed(replace(results[-1], method="ortools-first"), "timeout", "killed", seconds=610.0)]
     out = tmp_path / "results"
-    assert main(["report", str(write(tmp_path / "rows.jsonl", found)), "--out", str(out)]) == 0
+    assert main(["report", str(write(tmp_path / "rows.jsonl", results)), "--out", str(out)]) == 0
     names = ["report.md", "planning-time-figure4.png", "gaps-smoke.png"]
     assert capsys.readouterr().out.split() == [str(out / name) for name in names]
     assert sorted(path.name for path in out.iterdir()) == sorted(names)
@@ -244,5 +249,11 @@ def test_a_folder_gets_the_tables_and_the_pictures(tmp_path, capsys):
 
 
 def test_rows_come_back_as_they_were_written():
-    found = measured("nearest", HALVES, versions={"weights": "abc"}, machine={"cores": 2})[0]
-    assert rows.parse(json.dumps(asdict(found))) == found
+    written = measured("nearest", HALVES, versions={"weights": "abc"}, machine={"cores": 2})[0]
+    assert rows.parse(json.dumps(asdict(written))) == written
+
+
+def test_a_markdown_table_has_a_cell_for_each_head():
+    assert markdown_table(["a", "b"], [["x", 1], ["y", 2.5]]) == "| a | b |\n|---|---|\n| x | 1 |\n| y | 2.5 |"
+    with pytest.raises(ValueError, match="expected 2 cells in a line, got 1"):
+        markdown_table(["a", "b"], [["x"]])

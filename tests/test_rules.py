@@ -8,10 +8,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from faces import FACES, PLAYERS, Game, check_face, pick_any, pick_home, play, play_random
+from helpers.faces import FACES, PLAYERS, Game, check_face, pick_any, pick_home, play, play_random
+from helpers.oracle import Oracle
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracle import Oracle
 
 from mtsp_env import Instance, check_tours, makespan, rules
 from mtsp_env.instance import FIELDS, Problem

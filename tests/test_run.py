@@ -1,4 +1,4 @@
-"""Whatever a solver does is a row; what is on disk is whole and is not done again."""
+"""Whatever a solver does gives a row; rows on disk are complete and are not measured again."""
 
 import json
 import math
@@ -13,20 +13,23 @@ from pathlib import Path
 import pytest
 from misbehaving import FOLDER
 
-from benchmarks import rows, solvers, suite
+from benchmarks import solvers, suite
 from benchmarks.__main__ import main
-from benchmarks.crew import ONE_THREAD, Limits
-from benchmarks.run import plan, run
+from benchmarks.harness import rows
+from benchmarks.harness.jobs import Limits, make_jobs
+from benchmarks.harness.journal import Journal
+from benchmarks.harness.run import run
+from benchmarks.harness.supervisor import ONE_THREAD
 from mtsp_env import check_tours, makespan, read_tsplib
 
 ROOT = Path(__file__).parents[1]
-QUICK = Limits(limit=0.3, grace=0.3)
+QUICK = {"limit": 0.3, "grace": 0.3}
 
 
 def measure(tmp_path, *methods, **options):
     """Rows of the smoke test by method; one instance, unless the options say more."""
-    options = {"instances": 1, "seconds": [0.2], "limits": QUICK} | options
-    run("smoke", [f"misbehaving:{method}" for method in methods], tmp_path / "rows.jsonl", **options)
+    options = {"instances": 1, "seconds": (0.2,)} | QUICK | options
+    run("smoke", tmp_path / "rows.jsonl", tuple(f"misbehaving:{method}" for method in methods), **options)
     return {row.method.removeprefix("misbehaving:"): row for row in rows.read(tmp_path / "rows.jsonl")}
 
 
@@ -55,10 +58,10 @@ def test_a_run_from_end_to_end(tmp_path, capsys):
     assert main(command) == 0
     assert "12 new rows, 0 of them failed" in capsys.readouterr().out
     instances = suite.cells("smoke")[0].instances(suite.SEED)
-    found = rows.read(out)
-    for row in found:
+    results = rows.read(out)
+    for row in results:
         check_tours(instances[row.instance], row.tours)
-        assert row.makespan == makespan(instances[row.instance].nodes, row.tours)
+        assert row.makespan == makespan(instances[row.instance], row.tours)
         assert (row.table, row.cell, row.seed, row.status, row.error) == ("smoke", "8x2", 7, "ok", None)
         assert row.name == instances[row.instance].name
         assert row.seconds > 0 and row.cpu_seconds >= 0
@@ -67,10 +70,10 @@ def test_a_run_from_end_to_end(tmp_path, capsys):
         assert {"numpy", "mtsp-env"} <= row.versions.keys()
         assert ("numba" in row.versions) == (row.method == "reference")
     methods = ("reference", "misbehaving:proves")
-    assert {(row.instance, row.method, row.budget) for row in found} == {
+    assert {(row.instance, row.method, row.budget) for row in results} == {
         (i, method, budget) for i in range(3) for method in methods for budget in (0.02, 0.05)
     }
-    reference = [row for row in found if row.method == "reference"]
+    reference = [row for row in results if row.method == "reference"]
     assert all(row.budget <= row.seconds for row in reference)
 
     before = out.read_bytes()
@@ -84,10 +87,10 @@ def test_a_run_from_end_to_end(tmp_path, capsys):
 
 def test_methods_without_a_budget_are_run_once(tmp_path, monkeypatch):
     monkeypatch.setitem(solvers.SOLVERS, "once", solvers.Solver("misbehaving:deals", anytime=False))
-    jobs = plan(suite.cells("smoke", count=1), "smoke", ["once", "reference"], 7, [1, 10, 1.0])
+    jobs = make_jobs(suite.cells("smoke", count=1), "smoke", ["once", "reference"], 7, [1, 10, 1.0])
     assert [(job.method, job.budget) for job in jobs] == [("once", None), ("reference", 1.0), ("reference", 10.0)]
-    jobs.append(replace(jobs[-1], method="dan-improve"))  # which polishes for 10 s what it has taken its time for
-    assert [Limits(limit=60.0).of(job) for job in jobs] == [60.0, 1.0, 10.0, 70.0]
+    jobs.append(replace(jobs[-1], method="dan-improve"))  # which improves its first tours for 10 s
+    assert [Limits(limit=60.0).seconds(job) for job in jobs] == [60.0, 1.0, 10.0, 70.0]
 
 
 def test_every_kind_of_failure_is_a_row(tmp_path, monkeypatch):
@@ -99,17 +102,17 @@ def test_every_kind_of_failure_is_a_row(tmp_path, monkeypatch):
         "raises": ("error", "RuntimeError: out of ideas"),
         "forgets_a_city": ("wrong tours", "ValueError: city 2 missing from the tours"),
         "halves": ("wrong tours", "ValueError: tour 0 must be a list of at least 2 node numbers"),
-        "says_nothing": ("wrong tours", "TypeError"),
+        "returns_nothing": ("wrong tours", "TypeError"),
         "has_no_licence": ("unavailable", "no licence for Solver 9"),
         "lacks_a_package": ("unavailable", "package a_package_that_nobody_has is missing"),
         "finds_nothing": ("no tours", "no tours in 1 s"),
     }
-    found = measure(tmp_path, *kinds, "deals")
+    results = measure(tmp_path, *kinds, "deals")
     for method, (status, error) in kinds.items():
-        row = found[method]
+        row = results[method]
         assert (row.status, row.tours, row.makespan) == (status, None, None), method
         assert row.error.startswith(error)
-    assert found["deals"].ok  # the last, after all of them
+    assert results["deals"].ok  # the last, after all of them
 
 
 def test_what_hangs_is_killed_with_its_children(tmp_path, monkeypatch):
@@ -124,7 +127,7 @@ def test_what_hangs_is_killed_with_its_children(tmp_path, monkeypatch):
 
 
 def test_a_hanging_warm_up_is_killed_too(tmp_path):
-    row = measure(tmp_path, "hangs_in_the_warm_up", limits=replace(QUICK, warm_up=1.0))["hangs_in_the_warm_up"]
+    row = measure(tmp_path, "hangs_in_the_warm_up", warm_up=1.0)["hangs_in_the_warm_up"]
     assert (row.status, row.error) == ("timeout", "killed: not ready after 1 s")
 
 
@@ -143,9 +146,9 @@ def test_a_killed_run_loses_the_running_row_alone(tmp_path, how):
     )
     wait_until((tmp_path / "8x2-2.pids").exists)
     running.send_signal(how)
-    said = running.communicate(timeout=30)[1]
+    stderr = running.communicate(timeout=30)[1]
     assert running.returncode == (130 if how == signal.SIGINT else -signal.SIGKILL)
-    assert how == signal.SIGKILL or b"interrupted" in said
+    assert how == signal.SIGKILL or b"interrupted" in stderr
     pids = [int(pid) for pid in (tmp_path / "8x2-2.pids").read_text().split()]
     wait_until(lambda: not any(alive(pid) for pid in pids))
 
@@ -170,24 +173,24 @@ def test_failed_rows_are_run_again_only_on_demand(tmp_path, monkeypatch):
 
 
 def test_a_solver_is_warmed_up_once_and_gets_its_own_seed(tmp_path):
-    measure(tmp_path, "counts", instances=3, seconds=[0.1], seed=40)
-    found = rows.read(tmp_path / "rows.jsonl")
-    said = [json.loads(row.error.partition(": ")[2]) for row in found]
-    assert said == [[2, "8x2-0", 0.1, 40], [3, "8x2-1", 0.1, 41], [4, "8x2-2", 0.1, 42]]  # the first was the warm-up
+    measure(tmp_path, "counts", instances=3, seconds=(0.1,), seed=40)
+    results = rows.read(tmp_path / "rows.jsonl")
+    reports = [json.loads(row.error.partition(": ")[2]) for row in results]
+    assert reports == [[2, "8x2-0", 0.1, 40], [3, "8x2-1", 0.1, 41], [4, "8x2-2", 0.1, 42]]  # the first was the warm-up
 
 
 def test_a_worker_has_one_thread_and_one_core(tmp_path):
-    said = json.loads(measure(tmp_path, "looks_around")["looks_around"].error.partition(": ")[2])
-    assert set(ONE_THREAD.values()) == {"1"} and ONE_THREAD.items() <= said["threads"].items()
-    assert said["leads"]
-    assert said["cores"] is None or len(said["cores"]) == 1
+    report = json.loads(measure(tmp_path, "looks_around")["looks_around"].error.partition(": ")[2])
+    assert set(ONE_THREAD.values()) == {"1"} and ONE_THREAD.items() <= report["threads"].items()
+    assert report["leads"]
+    assert report["cores"] is None or len(report["cores"]) == 1
 
 
 def test_workers_share_the_rows(tmp_path):
     workers = min(2, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count())
     measure(tmp_path, "deals", "raises", instances=3, workers=workers)
-    found = rows.read(tmp_path / "rows.jsonl")
-    assert len({row.key for row in found}) == len(found) == 6
+    results = rows.read(tmp_path / "rows.jsonl")
+    assert len({row.key for row in results}) == len(results) == 6
 
 
 def test_a_journal_drops_a_torn_line_names_a_damaged_one_and_has_one_writer(tmp_path):
@@ -196,19 +199,19 @@ def test_a_journal_drops_a_torn_line_names_a_damaged_one_and_has_one_writer(tmp_
     line = path.read_bytes()
     for torn in (b"", line[:-1], line[:-5], b"{", b"\x00\x00"):
         path.write_bytes(line + torn)
-        with rows.Journal(path) as journal:
+        with Journal(path) as journal:
             assert journal.rows == [row]
             with pytest.raises(ValueError, match="another run is writing to it"):
-                rows.Journal(path)
+                Journal(path)
             journal.append(replace(row, instance=1))
         assert [r.instance for r in rows.read(path)] == [0, 1]
     path.write_bytes(line[:-9])  # nothing but a torn line
-    with rows.Journal(path) as journal:
+    with Journal(path) as journal:
         assert journal.rows == []
     assert path.read_bytes() == b""
     path.write_bytes(line + b"{}\n" + line)
     with pytest.raises(ValueError, match=r"rows\.jsonl:2: damaged line: expected an object with the fields"):
-        rows.Journal(path)
+        Journal(path)
     assert path.read_bytes() == line + b"{}\n" + line
 
 
@@ -217,11 +220,11 @@ def test_other_weights_are_not_mixed_in(tmp_path):
     ours = solvers.look_up("dan-greedy").versions()["weights"]
     assert len(ours) == 12
     path = tmp_path / "rows.jsonl"
-    with rows.Journal(path) as journal:
+    with Journal(path) as journal:
         journal.append(replace(row, method="dan-greedy", budget=None, versions={"weights": "0123456789ab"}))
     before = path.read_bytes()
     with pytest.raises(ValueError, match=f"rows of dan-greedy with weights 0123456789ab, now they are {ours}"):
-        run("smoke", ["dan"], path)
+        run("smoke", path, ("dan",))
     assert path.read_bytes() == before
 
 
@@ -236,7 +239,7 @@ def test_table_3_is_measured_rounded_and_not(tmp_path):
     assert suite.rounded_length(read_tsplib(folder / "eil51.tsp", 5), one) == 1 + 1 + 3 + 4
     assert suite.rounded_length(read_tsplib(folder / "eil51.tsp", 5), [[0, 2, 0]]) == 4
 
-    run("3", ["misbehaving:deals"], tmp_path / "rows.jsonl", seconds=[0.1], tsplib=folder)
+    run("3", tmp_path / "rows.jsonl", ("misbehaving:deals",), seconds=(0.1,), tsplib=folder)
     five, ten = rows.read(tmp_path / "rows.jsonl")
     assert (five.cell, ten.cell) == ("eil51x5", "eil51x10")
     # of five agents one has cities 1, 6, ...: out to (1, 1), on to (4, 2) and home; one goes by way of (2, 0)
@@ -245,14 +248,14 @@ def test_table_3_is_measured_rounded_and_not(tmp_path):
     assert five.makespan == pytest.approx(five.length / 4)
 
     with pytest.raises(ValueError, match="unknown cell 'eil76x5'; choose from"):
-        run("3", ["nearest"], tmp_path / "rows.jsonl", tsplib=folder, only=["eil76x5"])
+        run("3", tmp_path / "rows.jsonl", ("nearest",), tsplib=folder, cells=("eil76x5",))
     (folder / "eil51.tsp").rename(folder / "eil76.tsp")
     with pytest.raises(ValueError, match=r"eil76\.tsp: 76 nodes expected, got 51"):
-        run("3", ["nearest"], tmp_path / "rows.jsonl", tsplib=folder)
+        run("3", tmp_path / "rows.jsonl", ("nearest",), tsplib=folder)
     with pytest.raises(ValueError, match=r"none of eil51\.tsp, "):
-        run("3", ["nearest"], tmp_path / "rows.jsonl", tsplib=tmp_path)
-    with pytest.raises(ValueError, match="say where with --tsplib DIR"):
-        run("3", ["nearest"], tmp_path / "rows.jsonl")
+        run("3", tmp_path / "rows.jsonl", ("nearest",), tsplib=tmp_path)
+    with pytest.raises(ValueError, match="name its folder with --tsplib DIR"):
+        run("3", tmp_path / "rows.jsonl", ("nearest",))
 
 
 @pytest.mark.parametrize(
@@ -269,7 +272,7 @@ def test_table_3_is_measured_rounded_and_not(tmp_path):
         (["--seconds", "0"], "seconds must be a finite number of seconds above 0, got 0.0"),
         (["--grace", "nan"], "grace must be a finite number of seconds above 0, got nan"),
         (["--workers", "0"], "workers must be a whole number of at least 1, got 0"),
-        (["--workers", "100000"], "a core each, got 100000"),
+        (["--workers", "100000"], "the number of cores, got 100000"),
         (["--out", "rows.jsonl.gz"], "rows.jsonl.gz: rows are appended to plain files only"),
     ],
 )
@@ -277,6 +280,6 @@ def test_bad_input_is_one_line_and_changes_nothing(tmp_path, monkeypatch, capsys
     monkeypatch.chdir(tmp_path)
     command = ["run", "--table", "smoke", "--methods", "misbehaving:deals", "--out", "rows.jsonl", *options]
     assert main(command) == 2
-    said = capsys.readouterr().err.splitlines()
-    assert len(said) == 1 and message in said[0]
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and message in lines[0]
     assert not any(tmp_path.iterdir())

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from states import same
+from helpers.states import same
 from tiny import TINY
 
 from benchmarks.policies.attention_model import AttentionModel

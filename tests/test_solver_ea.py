@@ -1,4 +1,4 @@
-"""The evolutionary algorithm: its operators keep every city once, it never loses its best, it reaches small optima."""
+"""The evolutionary algorithm: operators keep permutations, the best is never lost, and small optima are reached."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import time
 
 import numpy as np
 import pytest
+from helpers.odd import ODD
 from hypothesis import given
 from hypothesis import strategies as st
-from odd import ODD
 
-from benchmarks.solvers import _optima, ea
+from benchmarks.solvers import ea
+from benchmarks.studies.optima import optimal_makespan
 from benchmarks.suite import Cell
 from mtsp_env import Instance, check_tours, lower_bound, makespan, uniform
 
@@ -18,7 +19,7 @@ sizes = st.tuples(st.integers(2, 12), st.integers(1, 6), st.integers(0, 10**6)) 
 
 
 def of_size(n_nodes: int, n_agents: int, seed: int) -> tuple[Instance, np.ndarray, np.random.Generator]:
-    """A uniform instance, 9 random chromosomes of it, and what else is random."""
+    """A uniform instance, 9 random chromosomes of it, and the random generator."""
     rng = np.random.default_rng(seed)
     instance = uniform(rng, n_nodes, n_agents)
     symbols = np.arange(1, ea.chromosome_length(instance) + 1)
@@ -53,7 +54,7 @@ def test_a_child_keeps_a_slice_of_one_parent_and_the_order_of_the_other(size):
 
 def test_a_mutation_brings_a_city_next_to_its_partner(monkeypatch):
     monkeypatch.setattr(ea, "NEAR", 1.0)
-    monkeypatch.setattr(ea, "LONGEST_MOVE", 1)  # of more cities that move, another one arrives
+    monkeypatch.setattr(ea, "LONGEST_MOVE", 1)  # if more cities move, another one can arrive
     partner = np.array([0, *range(7, 13), *range(1, 7)])  # 6 places away
     parents = np.tile(np.arange(1, 13), (300, 1))
     mutants = ea.mutate(parents, partner[:, None], np.random.default_rng(0))
@@ -64,8 +65,8 @@ def test_a_mutation_brings_a_city_next_to_its_partner(monkeypatch):
 def test_mutations_reverse_move_and_swap(monkeypatch):
     monkeypatch.setattr(ea, "NEAR", 0.0)
     mutants = ea.mutate(np.tile(np.arange(1, 8), (5000, 1)), np.zeros((8, 0), int), np.random.default_rng(0))
-    found = {tuple(mutant.tolist()) for mutant in mutants}
-    assert {(1, 5, 4, 3, 2, 6, 7), (1, 4, 5, 2, 3, 6, 7), (1, 5, 6, 7, 2, 3, 4), (1, 6, 3, 4, 5, 2, 7)} <= found
+    distinct = {tuple(mutant.tolist()) for mutant in mutants}
+    assert {(1, 5, 4, 3, 2, 6, 7), (1, 4, 5, 2, 3, 6, 7), (1, 5, 6, 7, 2, 3, 4), (1, 6, 3, 4, 5, 2, 7)} <= distinct
 
 
 @given(sizes)
@@ -84,7 +85,7 @@ def test_chromosomes_are_tours_as_the_judge_sees_them(size):
 
 def test_two_tours_by_hand(square, square_tours):
     chromosome = ea.encode(square_tours, square)
-    assert chromosome.tolist() == [2, 1, 3, 7, 4, 5, 6]  # 7 parts them
+    assert chromosome.tolist() == [2, 1, 3, 7, 4, 5, 6]  # 7 is the break point
     longest, fitness = ea.evaluate(np.array([chromosome, [7, 2, 1, 3, 4, 5, 6]]), 7, ea.symbol_distances(square))
     alone = 0.5 * 3 + np.hypot(0.5, 0.5) + 0.5 * 3  # 0 2 1 3, the diagonal to 4, 5 6 0
     assert longest == pytest.approx([2.0, alone])
@@ -119,7 +120,7 @@ def test_tiny_instances_are_solved_in_time_and_again_alike():
 
 def test_the_time_limit_holds_for_a_thousand_nodes():
     (instance,) = Cell(1000, 10, 1).instances(0)
-    began = time.process_time()  # of a processor that others may use as well
+    began = time.process_time()  # the processor may be shared
     check_tours(instance, ea.solve(instance, 0.3, 0))
     assert time.process_time() - began < 1.2 * 0.3 + 0.5
 
@@ -132,7 +133,7 @@ def test_odd_instances_are_solved(name):
 def test_the_optimum_of_small_instances_is_reached():
     for instance in [*Cell(7, 3, 2).instances(3), *Cell(8, 2, 3).instances(3)]:
         tours = ea.solve(instance, 60.0, 0, generations=300)
-        assert makespan(instance, tours) == pytest.approx(_optima.by_subsets(instance))
+        assert makespan(instance, tours) == pytest.approx(optimal_makespan(instance))
 
 
 @pytest.mark.parametrize("weight", [ea.MEAN_WEIGHT, 5.0])  # with 5, the fittest often have long tours

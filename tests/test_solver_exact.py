@@ -1,4 +1,4 @@
-"""``exact`` finds what trying everything finds, its bounds hold, and its rows rule out no tours that they must not."""
+"""``exact`` agrees with enumeration, its bounds hold, and its constraints exclude no optimal tours."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.solvers import Answer, NoTours, Unavailable, _milp, _optima, exact
+from benchmarks.solvers import Answer, NoTours, Unavailable, _milp, exact
 from benchmarks.solvers._two_index import Program, greedy_makespan
+from benchmarks.studies import optima
 from benchmarks.suite import Cell
 from mtsp_env import Instance, check_tours, lower_bound, makespan
 
@@ -23,7 +24,7 @@ needs_highs = pytest.mark.skipif(find_spec("highspy") is None, reason="needs the
 
 
 def try_everything(instance: Instance) -> float:
-    """The least makespan over all ways to give each city to an agent, and all orders of each agent's cities."""
+    """The smallest makespan over all assignments of cities to agents and all orders of each agent's cities."""
     distance = np.linalg.norm(instance.nodes[:, None] - instance.nodes[None], axis=2).tolist()
     cities = range(1, instance.n_nodes)
     shortest = {
@@ -61,7 +62,7 @@ def test_proofs_agree_with_trying_everything(instance):
     assert proof.optimal and proof.gap <= exact.PROVED
     assert proof.makespan == makespan(instance, proof.tours) == pytest.approx(optimum, rel=1e-6)
     assert lower_bound(instance) - 1e-12 <= proof.bound <= optimum + 1e-12
-    assert _optima.by_subsets(instance) == pytest.approx(optimum, rel=1e-12)
+    assert optima.optimal_makespan(instance) == pytest.approx(optimum, rel=1e-12)
 
 
 @needs_highs
@@ -93,7 +94,7 @@ def test_three_tiny_instances_are_solved_within_the_time_limit():
 
 
 @needs_highs
-def test_the_time_limit_is_kept_where_there_is_no_proof_in_time():
+def test_the_time_limit_holds_if_there_is_no_proof_in_time():
     instance = Cell(40, 3, 1).instances(0)[0]
     start = time.perf_counter()
     proof = exact.prove(instance, 1.0)
@@ -108,8 +109,8 @@ def test_given_tours_are_the_first_answer():
     instance = Cell(40, 3, 1).instances(0)[0]
     start = thirds(instance)
     program = Program(instance, start)
-    found = _milp.minimise(program.variables, program.rows, 1.0, 0, "highs", program.start)
-    assert found.values is not None  # without them, HiGHS finds none in a minute
+    result = _milp.minimise(program.variables, program.rows, 1.0, 0, "highs", program.start)
+    assert result.values is not None  # without a start, HiGHS has none after a minute
     assert makespan(instance, exact.solve(instance, 0.5, 0, start=start).tours) <= makespan(instance, start)
     small = SMALL[0]
     assert exact.prove(small, 60.0, start=thirds(small)).makespan == pytest.approx(try_everything(small), rel=1e-6)
@@ -117,16 +118,16 @@ def test_given_tours_are_the_first_answer():
         exact.prove(instance, 1.0, start=[[0, 1, 0], [0, 0], [0, 0]])
 
 
-def test_whatever_a_solver_says_the_proof_stays_sound(square, square_tours, monkeypatch):
-    for said, bound in [(1e9, 2.0), (1.9, 1.9 * (1 - exact.TOLERANCE)), (-np.inf, lower_bound(square))]:
-        monkeypatch.setattr(exact, "minimise", lambda *_, said=said: _milp.Found(np.zeros(1), said))
+def test_a_proof_is_sound_whatever_bound_a_solver_reports(square, square_tours, monkeypatch):
+    for claim, bound in [(1e9, 2.0), (1.9, 1.9 * (1 - exact.TOLERANCE)), (-np.inf, lower_bound(square))]:
+        monkeypatch.setattr(exact, "minimise", lambda *_, claim=claim: _milp.Result(np.zeros(1), claim))
         monkeypatch.setattr(Program, "tours", lambda *_: (thirds(square), []))  # longer than those given
         proof = exact.prove(square, 60.0, start=square_tours)
         assert (proof.tours, proof.makespan, proof.bound) == (square_tours, 2.0, bound)
 
 
 def thirds(instance: Instance) -> list[list[int]]:
-    """Each agent every m-th city."""
+    """Tours in which each agent visits every m-th city."""
     m = instance.n_agents
     return [[0, *range(1 + agent, instance.n_nodes, m), 0] for agent in range(m)]
 
@@ -134,7 +135,7 @@ def thirds(instance: Instance) -> list[list[int]]:
 @settings(deadline=None, max_examples=150)
 @given(data=st.data(), n=st.integers(2, 9), m=st.integers(1, 4), seed=st.integers(0, 10**6))
 def test_the_rows_hold_for_all_tours_within_the_limit(data, n, m, seed):
-    """Tours of any shape are a point of the program whose limit is their makespan: no row rules out an optimum."""
+    """Any tours are feasible in the program whose limit is their makespan, so no row excludes an optimum."""
     grid = data.draw(st.sampled_from([2, 5, 10**6]))  # coarse: cities in one place, on the depot, on a line
     nodes = np.random.default_rng(seed).integers(0, grid + 1, (n, 2)) / grid
     instance = Instance(nodes, m)
@@ -149,11 +150,11 @@ def test_the_rows_hold_for_all_tours_within_the_limit(data, n, m, seed):
     assert (program.start <= program.variables.upper + 1e-9).all()
     again, cycles = program.tours(program.start)
     assert not cycles
-    canonical = [sorted(min(tour, tour[::-1]) for tour in found if len(tour) > 2) for found in (again, tours)]
+    canonical = [sorted(min(tour, tour[::-1]) for tour in one if len(tour) > 2) for one in (again, tours)]
     assert canonical[0] == canonical[1]
 
 
-def test_cycles_without_the_depot_are_found_and_forbidden():
+def test_cycles_without_the_depot_are_forbidden():
     program = Program(Instance([[0.5, 0.5]] + [[0.2, 0.2]] * 3 + [[0.9, 0.5]], 1))
     arcs = dict(zip(zip(program.tail.tolist(), program.head.tolist(), strict=True), program.arc, strict=True))
     values = np.zeros(len(program.variables.cost))
@@ -187,7 +188,7 @@ def test_licensed_backends_prove_the_same_within_their_size_limits(backend, pack
 
 
 @pytest.mark.parametrize(("backend", "package"), [("highs", "highspy"), ("gurobi", "gurobipy"), ("cplex", "cplex")])
-def test_a_missing_backend_is_said(square, monkeypatch, backend, package):
+def test_a_missing_backend_is_named(square, monkeypatch, backend, package):
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(Unavailable, match=f"package {package} is missing"):
         exact.solve(square, 1.0, 0, backend)
@@ -199,23 +200,23 @@ def test_an_unknown_backend_is_bad_input(square):
 
 
 @needs_highs
-def test_the_check_tells_what_holds_and_what_does_not(monkeypatch):
+def test_the_table_of_optima_shows_what_is_confirmed(monkeypatch):
     pytest.importorskip("numba")
     pytest.importorskip("elkai")
-    monkeypatch.setattr(_optima, "LKH_SECONDS", 1.0)
-    rows = _optima.check(1)
-    assert rows[0].holds
-    assert rows[0].proof.makespan == pytest.approx(try_everything(_optima.CELLS[0].instances(7)[0]), rel=1e-6)
-    missed = replace(rows[0], lkh3=1.01 * rows[0].by_subsets)
-    unproved = replace(rows[0], proof=replace(rows[0].proof, bound=0.9 * rows[0].proof.makespan))
-    assert not missed.holds and not unproved.holds
-    lines = _optima.markdown([rows[0], missed, unproved]).splitlines()[2:]
+    monkeypatch.setattr(optima, "LKH_SECONDS", 1.0)
+    (optimum,) = optima.find_optima(1)
+    assert optimum.confirmed
+    assert optimum.proof.makespan == pytest.approx(try_everything(optima.CELLS[0].instances(7)[0]), rel=1e-6)
+    missed = replace(optimum, lkh3=1.01 * optimum.optimum)
+    unproved = replace(optimum, proof=replace(optimum.proof, bound=0.9 * optimum.proof.makespan))
+    assert not missed.confirmed and not unproved.confirmed
+    lines = optima.to_markdown([optimum, missed, unproved]).splitlines()[2:]
     assert lines[0].endswith("| reached | reached |") and "| yes |" in lines[0]
     assert lines[1].endswith(f"| reached | {missed.lkh3:.6f} |") and "| gap 10.00 % |" in lines[2]
     with pytest.raises(ValueError, match="count must be 1 to 20, got 21"):
-        _optima.check(21)
+        optima.find_optima(21)
 
 
 def test_sets_of_too_many_cities_are_bad_input():
     with pytest.raises(ValueError, match="n_nodes must be at most 13, got 14"):
-        _optima.by_subsets(Cell(14, 2, 1).instances(0)[0])
+        optima.optimal_makespan(Cell(14, 2, 1).instances(0)[0])

@@ -1,4 +1,4 @@
-"""LKH's tours solve the instance, its processes end in time and with their parents, whatever they do."""
+"""LKH's tours solve the instance; its processes end in time, and with their parents."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ needs_lkh = pytest.mark.skipif(
 )
 needs_posix = pytest.mark.skipif(os.name != "posix", reason="the program that stands in for LKH is a script")
 
-# Stands in for LKH: leaves the tours it is told to, then ends as it is told to, deaf to polite signals
+# Stands in for LKH: writes the tours in its orders, then ends as they say; it ignores SIGTERM
 PROGRAM = """#!{python}
 import json, os, signal, sys, time
 from pathlib import Path
 
 signal.signal(signal.SIGTERM, signal.SIG_IGN)
-told = json.loads(Path({told!r}).read_text())
-for name, text in told["files"].items():
+orders = json.loads(Path({orders!r}).read_text())
+for name, text in orders["files"].items():
     Path(name).write_text(text)
 seen = {{"pid": os.getpid(), "parameters": Path(sys.argv[1]).read_text(), "problem": Path("problem").read_text()}}
 Path({seen!r} + ".tmp").write_text(json.dumps(seen))
 Path({seen!r} + ".tmp").rename({seen!r})
-if told["hangs"]:
+if orders["hangs"]:
     time.sleep(600)
 print("*** Error ***", file=sys.stderr)
-sys.exit(told["code"])
+sys.exit(orders["code"])
 """
 
 
@@ -51,12 +51,12 @@ def tour_file(*numbers: int, complete: bool = True) -> str:
 
 @pytest.fixture
 def stand_in(tmp_path, monkeypatch):
-    """Call it to say what the LKH on the PATH does; what it has seen is then in the file it returns."""
+    """A function that puts a stand-in for LKH on the PATH; it returns the file with what the stand-in has seen."""
 
     def install(files: dict[str, str] | None = None, hangs: bool = False, code: int = 0) -> Path:
-        seen, told, program = tmp_path / "seen", tmp_path / "told", tmp_path / "LKH"
-        told.write_text(json.dumps({"files": files or {}, "hangs": hangs, "code": code}))
-        program.write_text(PROGRAM.format(python=sys.executable, told=str(told), seen=str(seen)))
+        seen, orders, program = tmp_path / "seen", tmp_path / "orders", tmp_path / "LKH"
+        orders.write_text(json.dumps({"files": files or {}, "hangs": hangs, "code": code}))
+        program.write_text(PROGRAM.format(python=sys.executable, orders=str(orders), seen=str(seen)))
         program.chmod(0o755)
         monkeypatch.setenv("PATH", str(tmp_path))
         return seen
@@ -90,7 +90,7 @@ def test_equal_seeds_and_trials_give_equal_tours():
 
 @needs_lkh
 def test_one_agent_is_a_travelling_salesman():
-    instance = Cell(60, 1, 1).instances(0)[0]  # LKH's first bound is not its optimum, so that it does search
+    instance = Cell(60, 1, 1).instances(0)[0]  # LKH's first bound is not the optimum, so it searches
     tours = lkh3.solve(instance, 10.0, 0, trials=10)
     check_tours(instance, tours)
     distance = np.linalg.norm(instance.nodes[:, None] - instance.nodes[None], axis=2)
@@ -128,7 +128,7 @@ def test_odd_instances_are_solved(name):
 @needs_posix
 def test_the_best_complete_tours_are_read_when_time_is_up(stand_in, square):
     files = {
-        "5_5.tour": tour_file(1, 2, 3, 4, 5, 6, 7, 8),  # 8 is the depot again: one agent does it all
+        "5_5.tour": tour_file(1, 2, 3, 4, 5, 6, 7, 8),  # 8 is the depot again: one agent visits every city
         "2_4.tour": tour_file(4, 1, 7, 6, 5, 8, 3, 2),
         "1_1.tour": tour_file(1, 2, 3, 4, 8, 5, 6, 7, complete=False),
     }
@@ -141,14 +141,14 @@ def test_the_best_complete_tours_are_read_when_time_is_up(stand_in, square):
 
 
 @needs_posix
-def test_no_tours_in_time_is_said(stand_in, square):
+def test_no_tours_in_time_raise(stand_in, square):
     stand_in(hangs=True)
     with pytest.raises(NoTours, match=r"not done in 0\.1 s"):
         lkh3.solve(square, 0.1, 0)
 
 
 @needs_posix
-def test_a_failure_of_lkh_is_told_in_its_words(stand_in, square):
+def test_a_failure_of_lkh_is_reported_with_its_message(stand_in, square):
     stand_in({"2_4.tour": tour_file(1, 4, 3, 2, 8, 5, 6, 7)}, code=3)
     with pytest.raises(RuntimeError, match=r"LKH ended with code 3: \*\*\* Error \*\*\*"):
         lkh3.solve(square, 30.0, 0)
@@ -161,8 +161,8 @@ def test_lkh_is_given_the_instance(stand_in):
     assert lkh3.solve(Instance(nodes, 9), 30.0, 41) == [[0, 1, 0], [0, 2, 0]] + [[0, 0]] * 7
     seen = json.loads(seen.read_text())
     given = dict(line.split(" = ") for line in seen["parameters"].splitlines() if " = " in line)
-    assert given["SALESMEN"] == "2"  # it takes no more than cities
-    assert given["OPTIMUM"] == "1500000"  # up and down, in millionths
+    assert given["SALESMEN"] == "2"  # at most as many as cities
+    assert given["OPTIMUM"] == "1500000"  # out and back, in millionths
     assert given["SEED"] == "42" and given["MTSP_OBJECTIVE"] == "MINMAX"
     assert 0 < float(given["TOTAL_TIME_LIMIT"]) <= 30.0
     assert seen["problem"].partition("NODE_COORD_SECTION\n")[2].split("\n")[:3] == [
@@ -172,14 +172,14 @@ def test_lkh_is_given_the_instance(stand_in):
     ]
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a process that its parent is gone")
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux can end a process with its parent")
 def test_lkh_ends_with_a_killed_parent(stand_in):
     seen = stand_in(hangs=True)
     code = (
         "from benchmarks.solvers import lkh3; from mtsp_env import Instance;"
         "lkh3.solve(Instance([[0, 0], [0, 1], [1, 0], [1, 1]], 2), 600.0, 0)"
     )
-    environment = os.environ | {"TMPDIR": str(seen.parent)}  # a killed parent cleans nothing up
+    environment = os.environ | {"TMPDIR": str(seen.parent)}  # a killed parent removes no files
     parent = subprocess.Popen([sys.executable, "-c", code], cwd=Path(__file__).parents[1], env=environment)
     try:
         wait_for(seen.exists)
@@ -198,7 +198,7 @@ def wait_for(condition, seconds: float = 60.0) -> None:
         time.sleep(0.01)
 
 
-def test_a_missing_lkh_is_said(square, monkeypatch):
+def test_a_missing_lkh_is_unavailable(square, monkeypatch):
     monkeypatch.setenv("PATH", "")
     monkeypatch.setattr(lkh3, "find_spec", lambda name: None)
     with pytest.raises(Unavailable, match="neither the program LKH nor the package elkai"):

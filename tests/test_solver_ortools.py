@@ -1,4 +1,4 @@
-"""OR-Tools gives right tours within its time: the plain first solution, its descent, and near-optimal guided search."""
+"""OR-Tools returns valid tours in its time: the first solution, its descent, and near-optimal guided search."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ import pytest
 
 pytest.importorskip("ortools.constraint_solver.pywrapcp")
 
-from odd import ODD
+from helpers.odd import ODD
 
-from benchmarks.solvers import NoTours, Unavailable, _optima, ortools
+from benchmarks.solvers import NoTours, Unavailable, ortools
+from benchmarks.studies.optima import optimal_makespan
 from benchmarks.suite import Cell
 from mtsp_env import Instance, check_tours, makespan
 
@@ -53,7 +54,7 @@ def test_guided_search_goes_on_until_its_time_is_over():
 @pytest.mark.parametrize("search", SEARCHES)
 def test_the_time_limit_holds_for_a_thousand_nodes(search):
     (instance,) = Cell(1000, 10, 1).instances(0)
-    began = time.process_time()  # of a processor that others may use as well
+    began = time.process_time()  # the processor may be shared
     try:
         check_tours(instance, ortools.solve(instance, 1.0, 0, search))
     except NoTours as error:
@@ -82,9 +83,9 @@ def test_a_descent_is_much_better_and_always_the_same():
 
 def test_guided_search_reaches_the_optimum_of_small_instances():
     for instance in [*Cell(7, 3, 2).instances(3), *Cell(8, 2, 2).instances(3)]:
-        optimum = _optima.by_subsets(instance)
+        optimum = optimal_makespan(instance)
         tours = ortools.solve(instance, 0.3, 0, "guided")
-        # SPAN_COST * longest + sum is least, and the optimum's sum is at most m times its longest
+        # SPAN_COST * longest + sum is minimal, and the optimum's sum is at most m times its longest tour
         slack = instance.n_agents * optimum / ortools.SPAN_COST + 10 / ortools.UNIT
         assert optimum - 1e-9 <= makespan(instance, tours) <= optimum + slack
 
@@ -102,9 +103,9 @@ def test_no_tour_is_longer_than_the_limit():
 def test_agents_share_the_cities_before_guided_search():
     for instance in Cell(60, 4, 2).instances(5):
         distance, seconds = whole_lengths(instance), 5.0
-        problem, found = ortools._share_cities(distance, 4, seconds, time.perf_counter() + seconds)
+        problem, assignment = ortools._share_cities(distance, 4, seconds, time.perf_counter() + seconds)
         share = makespan(instance, [nearest_next(instance)]) / 4
-        tours = problem.tours(found)
+        tours = problem.tours(assignment)
         check_tours(instance, tours)
         assert makespan(instance, tours) < share + 2 * distance[0].max() / ortools.UNIT
 
@@ -115,7 +116,7 @@ def test_the_nearest_city_next_is_as_long_as_its_tour():
     assert ortools._nearest_next(whole_lengths(instance)) == pytest.approx(ortools.UNIT * length, abs=30)
 
 
-def test_what_cannot_be_done_is_said():
+def test_unknown_searches_and_too_little_time_raise():
     (instance,) = Cell(8, 2, 1).instances(0)
     with pytest.raises(ValueError, match=r"unknown search 'magic'; choose from \['first'"):
         ortools.solve(instance, 1.0, 0, "magic")

@@ -1,4 +1,4 @@
-"""Self-organising maps: short rings win, each neuron one city, and they are where the guided evolution begins."""
+"""Self-organising maps: short rings win, a neuron wins one city, and the guided evolution starts from the maps."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("numba")
 
-from odd import ODD
+from helpers.odd import ODD
 
 from benchmarks.solvers import som
 from benchmarks.suite import Cell
@@ -39,7 +39,7 @@ def test_tiny_instances_are_solved_in_time_and_again_alike(guided):
 def test_the_time_limit_holds_for_a_thousand_nodes(guided):
     som._compile()
     (instance,) = Cell(1000, 10, 1).instances(0)
-    began = time.process_time()  # of a processor that others may use as well
+    began = time.process_time()  # the processor may be shared
     check_tours(instance, som.solve(instance, 0.3, 0, guided))
     assert time.process_time() - began < 1.2 * 0.3 + 0.5
 

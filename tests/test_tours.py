@@ -1,4 +1,4 @@
-"""The judge of tours: lengths by hand, every way to be wrong, and a bound below every solution."""
+"""The judge of tours: lengths by hand, every kind of invalid tour, and a bound below every solution."""
 
 import itertools
 import math
@@ -26,12 +26,12 @@ def shortest_tours(nodes: np.ndarray) -> dict[frozenset[int], float]:
 
 
 def optimum(instance: Instance) -> float:
-    """The best makespan, by trying all assignments of cities to agents."""
+    """The least makespan, by trying all assignments of cities to agents."""
     tours = shortest_tours(instance.nodes)
     n_cities, agents = instance.n_nodes - 1, range(instance.n_agents)
     return min(
-        max(tours[frozenset(city for city in range(1, n_cities + 1) if who[city - 1] == agent)] for agent in agents)
-        for who in itertools.product(agents, repeat=n_cities)
+        max(tours[frozenset(city for city in range(1, n_cities + 1) if owner[city - 1] == agent)] for agent in agents)
+        for owner in itertools.product(agents, repeat=n_cities)
     )
 
 
@@ -52,7 +52,7 @@ def test_lengths_by_hand() -> None:
     nodes = [[0.0, 0.0], [3.0, 4.0], [3.0, 0.0]]
     paths = [[0, 1, 2, 0], [0, 1, 0], [0, 0], [0], [0, 2, 1]]
     assert path_lengths(np.array(nodes), paths).tolist() == [12, 10, 0, 0, 7]
-    instance = from_coordinates(nodes, 2)  # four of its units to one
+    instance = from_coordinates(nodes, 2)  # scale 4: the extent of the nodes
     assert (tour_lengths(instance, paths) * instance.scale).tolist() == [12, 10, 0, 0, 7]
     assert makespan(instance, [[0, 1, 0], [0, 2, 0]]) * instance.scale == 10.0
     assert makespan(instance, []) == 0.0
@@ -71,8 +71,8 @@ def test_a_tour_is_as_long_backwards(instance: Instance, random) -> None:
 
 
 @st.composite
-def solved(draw) -> tuple[Instance, list[list[int]]]:
-    """An instance and valid tours of it, some of which pass the depot in between."""
+def instances_and_tours(draw) -> tuple[Instance, list[list[int]]]:
+    """An instance and tours that solve it, some of which pass the depot in the middle."""
     instance = draw(small)
     tours = [[0] for _ in range(instance.n_agents)]
     for city in draw(st.permutations(range(1, instance.n_nodes))):
@@ -82,7 +82,7 @@ def solved(draw) -> tuple[Instance, list[list[int]]]:
 
 
 @settings(deadline=None)
-@given(solved())
+@given(instances_and_tours())
 def test_valid_tours_pass_and_no_bound_is_above_them(case: tuple) -> None:
     instance, tours = case
     check_tours(instance, tours)
@@ -91,15 +91,15 @@ def test_valid_tours_pass_and_no_bound_is_above_them(case: tuple) -> None:
 
 
 @settings(deadline=None)
-@given(solved(), st.data())
-def test_a_lost_and_a_repeated_city_are_named(case: tuple, data) -> None:
+@given(instances_and_tours(), st.data())
+def test_a_missing_and_a_repeated_city_are_named(case: tuple, data: st.DataObject) -> None:
     instance, tours = case
     city = data.draw(st.integers(1, instance.n_nodes - 1))
-    lost = [[node for node in tour if node != city] for tour in tours]
+    missing = [[node for node in tour if node != city] for tour in tours]
     with pytest.raises(ValueError, match=f"^city {city} missing from the tours$"):
-        check_tours(instance, lost)
-    which = data.draw(st.integers(0, len(tours) - 1))
-    repeated = [[*tour[:-1], city, 0] if agent == which else tour for agent, tour in enumerate(tours)]
+        check_tours(instance, missing)
+    chosen = data.draw(st.integers(0, len(tours) - 1))
+    repeated = [[*tour[:-1], city, 0] if agent == chosen else tour for agent, tour in enumerate(tours)]
     with pytest.raises(ValueError, match=f"^city {city} visited more than once$"):
         check_tours(instance, repeated)
 
@@ -152,11 +152,13 @@ def test_the_bound_by_hand(square: Instance) -> None:
     [
         ([[0.2, 0.2], [0.2, 0.9]], 3, 1.4),  # one city
         ([[0.0, 0.0], [0.3, 0.0], [0.5, 0.0], [1.0, 0.0]], 1, 2.0),  # all on the way to the farthest
-        ([[0.5, 0.5], [1.0, 0.5], [0.5, 0.9], [0.5, 0.0]], 3, 1.0),  # an agent each
+        ([[0.5, 0.5], [1.0, 0.5], [0.5, 0.9], [0.5, 0.0]], 3, 1.0),  # one agent per city
         ([[0.7, 0.3]] * 4, 2, 0.0),  # all in one place
     ],
 )
-def test_the_bound_is_the_optimum_where_the_farthest_city_decides(nodes: list, n_agents: int, best: float) -> None:
+def test_the_bound_is_the_optimum_if_the_farthest_city_sets_the_makespan(
+    nodes: list, n_agents: int, best: float
+) -> None:
     instance = Instance(nodes, n_agents)
     assert lower_bound(instance) == pytest.approx(best, abs=1e-12)
     assert optimum(instance) == pytest.approx(best, abs=1e-12)

@@ -1,4 +1,4 @@
-"""TSPLIB files: lengths by hand for each type, every damaged file refused by name, the instances of the paper."""
+"""TSPLIB files: lengths by hand for each type, errors that name a damaged file, the instances of the paper."""
 
 import itertools
 import math
@@ -21,14 +21,14 @@ SHARED = ROOT.parent / "shared" / "data" / "tsplib"
 
 @pytest.fixture
 def read(tmp_path):
-    """Write a file and read it: read(kind, rows) for a good one, read(text=...) for any."""
+    """A function that writes a file and reads it: read(kind, rows) for a valid file, read(text=...) for any text."""
 
     def write_and_read(kind: str = "EUC_2D", rows: list | None = None, text: str | bytes | None = None) -> Instance:
         if text is None:
             rows = [(0, 0), (3, 4)] if rows is None else rows
             text = "\n".join(
                 [
-                    "NAME : made",
+                    "NAME : example",
                     "TYPE : TSP",
                     "COMMENT : two: colons",
                     f"DIMENSION : {len(rows)}",
@@ -38,7 +38,7 @@ def read(tmp_path):
                     "EOF",
                 ]
             )
-        path = tmp_path / "made.tsp"
+        path = tmp_path / "example.tsp"
         path.write_bytes(text if isinstance(text, bytes) else text.encode())
         return read_tsplib(path, 2)
 
@@ -63,7 +63,7 @@ def great_circle(one: tuple[float, float], other: tuple[float, float]) -> float:
 @pytest.mark.parametrize("kind", ["EUC_2D", "CEIL_2D"])
 def test_plane_by_hand(read, kind: str) -> None:
     instance = read(kind, [(10, 20), (13, 24), (10.5, -20)])
-    assert (instance.name, instance.n_nodes, instance.n_agents, instance.scale) == ("made", 3, 2, 44.0)
+    assert (instance.name, instance.n_nodes, instance.n_agents, instance.scale) == ("example", 3, 2, 44.0)
     assert lengths(instance)[0] == pytest.approx([0, 5, math.hypot(0.5, 40)])  # not rounded: 40.003
 
 
@@ -98,7 +98,7 @@ places = st.tuples(st.floats(-90, 90), st.floats(-180, 180))
 
 
 @given(st.lists(places, min_size=2, max_size=6))
-def test_projection_is_too_long_by_at_most_its_bound(points: list) -> None:
+def test_projected_lengths_are_within_the_bound(points: list) -> None:
     """Never shorter than the great circle, longer by at most r / sin(r) for nodes within r of the centroid."""
     latitude, longitude = np.radians(points).T
     sphere = np.stack([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)])
@@ -110,11 +110,11 @@ def test_projection_is_too_long_by_at_most_its_bound(points: list) -> None:
     assert np.linalg.norm(plane, axis=1).max() == pytest.approx(EARTH_RADIUS * radius, abs=0.5)
     for i, j in itertools.combinations(range(len(points)), 2):
         flat, true = math.dist(plane[i], plane[j]), great_circle(points[i], points[j])
-        assert flat >= true - 0.5  # km; acos is no better than that for close points
+        assert flat >= true - 0.5  # km, the precision of acos for close points
         assert radius > math.pi / 2 or flat <= true * (radius / math.sin(radius) if radius else 1) + 0.5
 
 
-def test_europe_is_as_exact_as_the_docstring_says() -> None:
+def test_europe_is_as_precise_as_documented() -> None:
     instance = read_tsplib(ROOT / "examples" / "europe.tsp", 4)
     assert (instance.name, instance.n_nodes, instance.n_agents) == ("europe", 52, 4)
     rows = [line.split() for line in (ROOT / "examples" / "europe.tsp").read_text().splitlines() if line[0].isdigit()]
@@ -126,16 +126,16 @@ def test_europe_is_as_exact_as_the_docstring_says() -> None:
     assert error.max() < 0.015
     assert error.mean() == pytest.approx(0.0011, abs=0.0001)
     prague_vienna, prague_lisbon = lengths(instance)[0, [1, 7]]
-    assert prague_vienna == pytest.approx(252, abs=3)  # km, as an atlas has it
+    assert prague_vienna == pytest.approx(252, abs=3)  # km, from an atlas
     assert prague_lisbon == pytest.approx(2245, abs=10)
 
 
-# What else is in a file
+# Other fields of a file
 
 
 def test_name_type_and_encoding(read, tmp_path) -> None:
     head, tail = "DIMENSION: 2\nEDGE_WEIGHT_TYPE: EUC_2D\n", "NODE_COORD_SECTION\n1 0 0\n2 3.0e0 4\n"
-    assert read(text=head + tail).name == "made"  # the file's
+    assert read(text=head + tail).name == "example"  # from the file's name
     assert read(text="NAME: 123\n" + head + tail).name == "123"
     assert read(text="TYPE: TSP (M. Hofmeister)\n" + head + tail).n_nodes == 2
     assert read(text=("COMMENT: Grötschel\r\n" + head + tail).encode("latin-1")).scale == 4.0
@@ -179,7 +179,7 @@ GOOD = "DIMENSION: 2\nEDGE_WEIGHT_TYPE: EUC_2D\nNODE_COORD_SECTION\n1 0 0\n2 3 4
         (GOOD.replace("1 0 0", "0 0").replace("2 3 4", "3 4"), "every row of NODE_COORD_SECTION must be"),
         (GOOD.replace("1 0 0", "1 0 0 0").replace("2 3 4", "2 3 4 5"), "every row of NODE_COORD_SECTION must be"),
         (GOOD.replace("2 3 4", "2 three 4"), "every row of NODE_COORD_SECTION must be"),
-        (GOOD.replace("2 3 4", f"2 3 {10**400}"), "made.tsp: "),
+        (GOOD.replace("2 3 4", f"2 3 {10**400}"), "example.tsp: "),
         (GOOD.replace("2 3 4", "2 nan 4"), r"coordinates must be finite, got \[nan, 4.0\] in row 2"),
         (GOOD.replace("2 3 4", "2 3 -inf"), r"coordinates must be finite, got \[3.0, -inf\] in row 2"),
         (GOOD.replace("EUC_2D", "GEO").replace("2 3 4", "2 91.0 4"), r"latitude in \[-90, 90\]"),
@@ -189,15 +189,15 @@ GOOD = "DIMENSION: 2\nEDGE_WEIGHT_TYPE: EUC_2D\nNODE_COORD_SECTION\n1 0 0\n2 3 4
         (GOOD.replace("EOF", "DEPOT_SECTION\n2\n-1\nEOF"), "DEPOT_SECTION must name node 1"),
     ],
 )
-def test_bad_file_is_refused_by_name(read, text: str | bytes, message: str) -> None:
+def test_an_invalid_file_is_refused_and_named(read, text: str | bytes, message: str) -> None:
     with pytest.raises(ValueError, match=message) as caught:
         read(text=text)
-    assert "made.tsp: " in str(caught.value)
+    assert "example.tsp: " in str(caught.value)
 
 
 @given(junk=st.binary(max_size=200), where=st.integers(0, len(GOOD)), cut=st.integers(0, len(GOOD)))
-def test_junk_never_raises_anything_else(tmp_path_factory, junk: bytes, where: int, cut: int) -> None:
-    """A file that is cut, or has junk put in, is either read or refused as a ValueError that names it."""
+def test_damaged_files_raise_no_other_error(tmp_path_factory, junk: bytes, where: int, cut: int) -> None:
+    """A file with a part missing or junk inserted is either read or refused with a ValueError that names it."""
     path = tmp_path_factory.getbasetemp() / "junk.tsp"
     path.write_bytes(GOOD[:where].encode() + junk + GOOD[max(where, cut) :].encode())
     try:
@@ -206,7 +206,7 @@ def test_junk_never_raises_anything_else(tmp_path_factory, junk: bytes, where: i
         assert "junk.tsp: " in str(error)
 
 
-def test_no_file_a_directory_and_no_agents(tmp_path) -> None:
+def test_a_missing_file_a_directory_and_no_agents_are_refused(tmp_path) -> None:
     with pytest.raises(OSError, match="nowhere"):
         read_tsplib(tmp_path / "nowhere.tsp", 2)
     with pytest.raises(ValueError, match="a directory, not a TSPLIB file"):
@@ -227,7 +227,7 @@ def test_without_vrplib_the_message_says_what_to_install(monkeypatch) -> None:
 PUBLISHED = sorted(SHARED.glob("*.tsp"))
 
 
-@pytest.mark.skipif(not PUBLISHED, reason="TSPLIB's own files are not part of this repository")
+@pytest.mark.skipif(not PUBLISHED, reason="needs the TSPLIB files of the paper's Table 3")
 @pytest.mark.parametrize("path", PUBLISHED, ids=lambda path: path.stem)
 def test_published_file_keeps_its_lengths(path: Path) -> None:
     instance = read_tsplib(path, 3)
@@ -237,8 +237,8 @@ def test_published_file_keeps_its_lengths(path: Path) -> None:
     np.testing.assert_allclose(lengths(instance), np.linalg.norm(xy[:, None] - xy, axis=2), atol=1e-9)
 
 
-@pytest.mark.skipif(not PUBLISHED, reason="TSPLIB's own files are not part of this repository")
+@pytest.mark.skipif(not PUBLISHED, reason="needs the TSPLIB files of the paper's Table 3")
 def test_gtsp150_has_the_bound_that_the_paper_prints() -> None:
-    """With 20 agents the farthest city decides; Table 3 prints 1554.64 under "kroa150"."""
+    """With 20 agents the farthest city sets the makespan; Table 3 gives 1554.64 under the name "kroa150"."""
     instance = read_tsplib(SHARED / "gtsp150.tsp", 20)
     assert lower_bound(instance) * instance.scale == pytest.approx(1554.64, abs=0.01)

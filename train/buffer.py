@@ -18,6 +18,7 @@ from dan_policy.actor import Key
 from dan_policy.registry import find
 from train.config import ImitateConfig
 from train.demonstrations import Demonstrations, as_decisions, demonstrate
+from train.plans import PLAN_KEYS, add_plans
 
 
 class Buffer:
@@ -29,10 +30,11 @@ class Buffer:
     Args:
         keys: the parts of the observation that the network needs.
         rng: draws sets and decision indices.
+        plans: label each decision with the teacher's plan for all agents (``train.plans``).
     """
 
-    def __init__(self, config: ImitateConfig, keys: Sequence[Key], rng: np.random.Generator):
-        self.config, self.keys, self.rng = config, keys, rng
+    def __init__(self, config: ImitateConfig, keys: Sequence[Key], rng: np.random.Generator, plans: bool = False):
+        self.config, self.keys, self.rng, self.plans = config, keys, rng, plans
         self.student = None if config.roll_in is None else hashlib.sha256(find(config.roll_in).read_bytes()).hexdigest()
         self.indices: list[int] = []  # index of each set at hand
         self.left: list[list[int]] = []  # decision indices of each that are still to be drawn
@@ -58,7 +60,7 @@ class Buffer:
     def add(self, index: int) -> None:
         """Make the set of that index, and choose which of its decision indices to draw, in random order."""
         demonstrations = self._demonstrations(index)
-        decisions, valid = as_decisions(demonstrations, self.keys, self.config)
+        decisions, valid = self._decisions(demonstrations)
         count = max(1, round(self.config.passes * len(valid)))
         if self.config.roll_in is None:
             steps = self.rng.permutation(len(valid))[:count]
@@ -68,6 +70,14 @@ class Buffer:
         self.left.append(steps.tolist())
         self.sets.append((decisions, valid))
         self.next, self.instances = index + 1, self.instances + valid.shape[1]
+
+    def _decisions(self, demonstrations: Demonstrations) -> tuple[TensorDictBase, Tensor]:
+        """The set's decisions [T, B] with everything that is learnt from, and valid (T, B)."""
+        if not self.plans:
+            return as_decisions(demonstrations, self.keys, self.config)
+        keys = tuple(dict.fromkeys((*self.keys, *PLAN_KEYS)))
+        decisions, valid = as_decisions(demonstrations, keys, self.config)
+        return add_plans(decisions, demonstrations), valid
 
     def _demonstrations(self, index: int) -> Demonstrations:
         """The set of that index. Workers are kept busy with the next sets, twice as many as there are workers."""
@@ -100,7 +110,7 @@ class Buffer:
         if state["student"] != self.student:
             raise ValueError(f"roll_in={self.config.roll_in!r} holds other weights than when the run began")
         self.indices, self.left = list(state["indices"]), [list(left) for left in state["left"]]
-        self.sets = [as_decisions(self._demonstrations(index), self.keys, self.config) for index in self.indices]
+        self.sets = [self._decisions(self._demonstrations(index)) for index in self.indices]
         self._pending.clear()
         self.next, self.instances = state["next"], state["instances"]
 

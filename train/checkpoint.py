@@ -24,6 +24,7 @@ FREE_ON_RESUME = (
     "checkpoint_every",
     "device",
     "workers",
+    "anneal_seconds",
 )
 
 

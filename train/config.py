@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from dan_policy.dan import DANConfig
+from dan_policy.joint import JointConfig
 from dan_policy.registry import NETWORKS
 from mtsp_env.checks import check_count, check_seconds
 from mtsp_env.distributions import Generator, check_distribution
@@ -55,6 +56,8 @@ class RunConfig:
     """Keyword arguments of the factory: NAME VALUE NAME VALUE ..."""
     network: DANConfig = field(default_factory=DANConfig.paper)
     """Options of the policy dan."""
+    joint: JointConfig = field(default_factory=JointConfig)
+    """Options of the policy joint."""
     init: str | None = None
     """Weights to start from: a file, or the name of a shipped model. A registered network takes its options from it."""
     prune_visited: bool | None = None
@@ -278,6 +281,15 @@ class ImitateConfig(RunConfig):
     """Steps of the warm-up."""
     weight_decay: float = 0.01
     """AdamW's weight decay."""
+    anneal_seconds: float | None = None
+    """The learning rate reaches its final value after this many seconds of training, even before `steps` are reached.
+    Such a run follows the clock, and does not resume bit for bit."""
+    next_weight: float = 0.5
+    """Weight in the loss of every other agent's next node in the teacher's plan. 0: only the deciding agent's. Without
+    effect on networks that have no such output (`forward_dense`), such as DAN."""
+    assignment_weight: float = 1.0
+    """Weight in the loss of which agent visits each city in the teacher's plan. 0: not learnt. Without effect on
+    networks that have no such output."""
     average: float = 0.999
     """Decay of the running average of the weights, which is what is validated and saved. 0 disables averaging."""
     validate_every: int = 500
@@ -300,5 +312,8 @@ class ImitateConfig(RunConfig):
             raise ValueError(f"passes must be above 0 and at most 1, got {self.passes!r}")
         if not 0 < self.final_rate <= 1:
             raise ValueError(f"final_rate must be above 0 and at most 1, got {self.final_rate!r}")
-        if not self.weight_decay >= 0:
-            raise ValueError(f"weight_decay must be at least 0, got {self.weight_decay!r}")
+        for name in ("weight_decay", "next_weight", "assignment_weight"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must be at least 0, got {getattr(self, name)!r}")
+        if self.anneal_seconds is not None:
+            check_seconds("anneal_seconds", self.anneal_seconds)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from functools import partial
 from typing import Annotated, Any, NamedTuple
 
 import torch
@@ -12,7 +11,8 @@ import tyro
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from dan_policy.actor import make_actor
+from dan_policy.actor import make_actor, network_keys
+from dan_policy.joint import DenseLogits
 from dan_policy.registry import find
 from train.buffer import Buffer
 from train.collect import autocast
@@ -21,6 +21,7 @@ from train.learner import Learner
 from train.loop import check_folder, run
 from train.loss import log_probs
 from train.network import observation_keys
+from train.plans import plan_losses
 
 
 class ImitationLearner(Learner):
@@ -33,8 +34,9 @@ class ImitationLearner(Learner):
         self.optimiser = torch.optim.AdamW(
             self.network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
         )
-        self.schedule = torch.optim.lr_scheduler.LambdaLR(self.optimiser, partial(rate, config))
-        self.buffer = Buffer(config, observation_keys(self.network), self.rng)
+        self.schedule = torch.optim.lr_scheduler.LambdaLR(self.optimiser, lambda step: rate(config, step, self.seconds))
+        plans = learns_plans(self.network, config)
+        self.buffer = Buffer(config, observation_keys(self.network), self.rng, plans)
 
     def train_step(self) -> dict[str, float]:
         """Take one optimiser step on decisions of some sets of the buffer. Returns the numbers to log."""
@@ -42,13 +44,16 @@ class ImitationLearner(Learner):
         batches = self.buffer.draw(config.sets_per_step)
         waited = time.perf_counter() - start
         self.optimiser.zero_grad()
-        loss = agreed = torch.zeros((), device=config.device)  # kept there, so that a GPU is not waited for
+        loss = next_loss = assignment_loss = agreed = torch.zeros((), device=config.device)  # a GPU is not waited for
         for decisions in batches:  # each counts the same: one of 16 games at n = 200 as much as one of 256 at n = 20
             with autocast(config):
-                part = imitation_loss(self.network, decisions)
-                mean = part.loss / len(batches)
-            mean.backward()
-            loss, agreed = loss + mean.detach(), agreed + part.agreed
+                part = imitation_losses(self.network, decisions)
+            total = part.loss + config.next_weight * part.next + config.assignment_weight * part.assignment
+            (total / len(batches)).backward()
+            loss = loss + part.loss.detach() / len(batches)
+            next_loss = next_loss + part.next.detach() / len(batches)
+            assignment_loss = assignment_loss + part.assignment.detach() / len(batches)
+            agreed = agreed + part.agreed
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.max_grad_norm)
         self.optimiser.step()
         self.schedule.step()
@@ -59,6 +64,8 @@ class ImitationLearner(Learner):
         count = sum(map(len, batches))
         return {
             "loss": float(loss),
+            "next_loss": float(next_loss),
+            "assignment_loss": float(assignment_loss),
             "agreement": float(agreed) / count,
             "grad_norm": float(norm),
             "learning_rate": float(self.schedule.get_last_lr()[0]),
@@ -81,25 +88,54 @@ class ImitationLearner(Learner):
         self.buffer.close()
 
 
-class ImitationLoss(NamedTuple):
-    """The loss of a batch of N decisions, and how often the network agrees with the teacher."""
+class ImitationLosses(NamedTuple):
+    """The losses of a batch of N decisions, and how often the network agrees with the teacher."""
 
-    loss: Tensor  # () with gradients
+    loss: Tensor  # () mean cross-entropy with the teacher's actions, with gradients
+    next: Tensor  # () of the other agents' next nodes (``plan_losses``); 0 without plans
+    assignment: Tensor  # () of the cities' visitors; 0 without plans
     agreed: Tensor  # () number of decisions whose teacher's action has a probability above 1/2
 
 
-def imitation_loss(network: nn.Module, decisions: TensorDictBase) -> ImitationLoss:
-    """Mean cross-entropy with the teacher's ``action`` over decisions [N] of one set."""
-    log_prob = log_probs(make_actor(network), decisions)
-    return ImitationLoss(-log_prob.mean(), (log_prob.detach() > math.log(0.5)).sum())
+def imitation_losses(network: nn.Module, decisions: TensorDictBase) -> ImitationLosses:
+    """Cross-entropies with the teacher's ``action`` and, if the decisions have one, its ``plan``.
+
+    Args:
+        network: a network, with ``forward_dense`` if there are plans.
+        decisions: TensorDict [N] of one set.
+    """
+    if "plan" in decisions.keys():  # noqa: SIM118 (a TensorDict is no mapping)
+        forward_dense: Any = network.forward_dense
+        logits: DenseLogits = forward_dense(*(decisions[key] for key in network_keys(network)))
+        log_prob = logits.policy.masked_fill(~decisions["action_mask"], -torch.inf).log_softmax(1)
+        log_prob = log_prob.gather(1, decisions["action"][:, None])[:, 0]
+        next_loss, assignment_loss = plan_losses(logits, decisions)
+    else:
+        log_prob = log_probs(make_actor(network), decisions)
+        next_loss = assignment_loss = log_prob.new_zeros(())
+    agreed = (log_prob.detach() > math.log(0.5)).sum()
+    return ImitationLosses(-log_prob.mean(), next_loss, assignment_loss, agreed)
 
 
-def rate(config: ImitateConfig, step: int) -> float:
-    """Factor on the learning rate: a linear warm-up, then half a cosine down to ``final_rate``."""
+def learns_plans(network: nn.Module, config: ImitateConfig) -> bool:
+    """Whether the teacher's whole plans are labels: the network has the outputs, and a weight is above 0."""
+    return hasattr(network, "forward_dense") and max(config.next_weight, config.assignment_weight) > 0
+
+
+def rate(config: ImitateConfig, step: int, seconds: float = 0.0) -> float:
+    """Factor on the learning rate: a linear warm-up, then half a cosine down to ``final_rate``.
+
+    Args:
+        config: the run's options.
+        step: number of optimiser steps so far.
+        seconds: time spent in training so far; it counts if ``anneal_seconds`` is set.
+    """
     if step < config.warmup:
         return (step + 1) / config.warmup
-    elapsed = min(1.0, (step - config.warmup) / max(1, config.steps - config.warmup))
-    return config.final_rate + (1 - config.final_rate) * (1 + math.cos(math.pi * elapsed)) / 2
+    elapsed = (step - config.warmup) / max(1, config.steps - config.warmup)
+    if config.anneal_seconds is not None:
+        elapsed = max(elapsed, seconds / config.anneal_seconds)
+    return config.final_rate + (1 - config.final_rate) * (1 + math.cos(math.pi * min(1.0, elapsed))) / 2
 
 
 def imitate(config: Annotated[ImitateConfig, tyro.conf.arg(name="")]) -> ImitationLearner:

@@ -1,1 +1,1 @@
-"""Other policies as networks: observation -> logits, given to ``dan_policy.make_actor``."""
+"""Other policies as networks: functions from an observation to logits, for ``dan_policy.make_actor``."""

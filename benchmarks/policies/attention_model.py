@@ -1,7 +1,7 @@
 """The attention model of Kool et al. 2019 ("Attention, Learn to Solve Routing Problems!"), one of the paper's rows.
 
-It was made for one vehicle and sees no other agent: what DAN adds is what this leaves out. A graph encoder over all
-nodes; a context of the mean node, the agent's own node and the depot; a glimpse under the mask; a single-head pointer.
+It was designed for one vehicle and does not see other agents, which DAN adds. It has a graph encoder over all nodes; a
+context of the mean node, the agent's own node and the depot; a glimpse under the mask; and a single-head pointer.
 
 >>> actor = make_actor(AttentionModel())
 >>> # python -m train imitate --policy benchmarks.policies.attention_model:AttentionModel
@@ -17,10 +17,10 @@ TANH_CLIP = 10.0  # C: logits lie in [-C, C]
 
 
 class AttentionModel(nn.Module):
-    """Observation -> logits, as ``make_actor`` takes it.
+    """A network from an observation to logits.
 
-    Batch normalisation, as in the paper, would mix the decisions of a batch (all nodes of all games at one index), and
-    a single game has none to be normalised with when it is played: layer normalisation takes its place.
+    The paper's batch normalisation would mix the decisions of a batch, and a single game has no batch to normalise
+    with. Layer normalisation takes its place.
     """
 
     def __init__(self, embed_dim: int = 128, feedforward_dim: int = 512, n_heads: int = 8, layers: int = 3):
@@ -37,17 +37,21 @@ class AttentionModel(nn.Module):
         self.glimpse_out = nn.Linear(embed_dim, embed_dim, bias=False)
 
     def forward(self, cities: Tensor, agents: Tensor, visited: Tensor) -> Tensor:
-        """cities (..., n, 2) relative to the deciding agent, agents (..., m, 3) ignored, visited (..., n) -> (..., n).
+        """Logits (..., n).
 
-        As seen from the depot, coordinates stay what they are during a game, as in the original.
+        Args:
+            cities: (..., n, 2) relative to the deciding agent. The network uses them relative to the depot, where they
+                do not change during a game, as in the original.
+            agents: (..., m, 3), ignored.
+            visited: (..., n), bool.
         """
         lead, n = cities.shape[:-2], cities.shape[-2]
         cities, visited = cities.reshape(-1, n, 2), visited.reshape(-1, n)
-        here = cities.square().sum(-1).argmin(1)  # (B,) the agent's own node: the nearest, at distance 0
+        here = cities.square().sum(-1).argmin(1)  # (B,) the agent's own node, at distance 0
         nodes = cities - cities[:, :1]  # (B, n, 2)
         h = self.encoder(torch.cat([self.embed_depot(nodes[:, :1]), self.embed_city(nodes[:, 1:])], 1))  # (B, n, d)
 
-        # Kool et al., Sec. 3.2, Decoder: context, glimpse over the nodes that are left, single-head pointer
+        # Kool et al., Sec. 3.2, Decoder: context, glimpse over the unvisited nodes, single-head pointer
         own = h[torch.arange(len(h), device=h.device), here]
         query = self.context(torch.cat([h.mean(1), own, h[:, 0]], 1))[:, None]  # (B, 1, d)
         q, k, v = (self._heads(x) for x in (query, self.glimpse_key(h), self.glimpse_value(h)))

@@ -1,4 +1,4 @@
-"""The nearest-city rule as a policy: what every learned one must beat."""
+"""Two simple policies as networks: go to the nearest city, and choose at random."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from torch import Tensor
 
 
 def nearest(cities: Tensor, agents: Tensor, visited: Tensor) -> Tensor:
-    """Logits (..., n): the nearer the likelier, the depot only where nothing else is legal.
+    """Logits (..., n) that prefer nearer cities; the depot is chosen only if no other node is legal.
 
-    ``cities`` (..., n, 2) are relative to the deciding agent, so their norm is the distance to go.
+    ``cities`` (..., n, 2) are relative to the deciding agent, so their norms are its distances.
     """
     logits = -cities.norm(dim=-1)
     logits[..., 0] = -1e9
@@ -17,5 +17,5 @@ def nearest(cities: Tensor, agents: Tensor, visited: Tensor) -> Tensor:
 
 
 def uniformly_random(cities: Tensor, agents: Tensor, visited: Tensor) -> Tensor:
-    """Logits (..., n): every legal node alike."""
+    """Equal logits (..., n), so that legal nodes are equally likely."""
     return torch.zeros(cities.shape[:-1], device=cities.device)

@@ -1,6 +1,6 @@
-"""Solvers for the tables: ``solve(instance, seconds, seed) -> tours``, one file each; SOLVERS names them.
+"""Solvers: functions ``solve(instance, seconds, seed) -> tours``, one file each; SOLVERS lists them by name.
 
-Naming a solver imports nothing: its module, and what that module needs, is loaded when ``find`` is asked for it.
+A solver's module and the packages that it needs are imported by ``find``, not before.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from mtsp_env.instance import Instance, Tours
 
 
 class Unavailable(RuntimeError):
-    """The solver cannot run here: a package, a program or a licence is missing. The message says which."""
+    """The solver cannot run because a package, a program or a licence is missing. The message says which."""
 
 
 class NoTours(RuntimeError):
-    """The solver found no tours within its time."""
+    """The solver found no tours in its time."""
 
 
 class Answer(NamedTuple):
-    """What a solver may return that knows more than tours.
+    """What a solver with bounds returns instead of tours.
 
     Attributes:
-        tours: one per agent, [0, ..., 0].
-        bound: no makespan is below this, in the unit square's lengths; None: not known.
+        tours: one tour per agent, [0, ..., 0].
+        bound: lower bound on the makespan, in lengths of the unit square; None if it is unknown.
     """
 
     tours: Tours
@@ -46,17 +46,17 @@ Solve = Callable[[Instance, float, int], "Tours | Answer"]
 
 @dataclass(frozen=True)
 class Solver:
-    """Where a solver is found, and what the tables must know of it.
+    """How to load a solver, and how it is run.
 
     Attributes:
         target: "package.module:function".
         options: keyword arguments bound to the function.
-        anytime: it goes on for as long as it may, so that it is run once for each budget of seconds. Others are run
-            once, and only limited.
-        polishes: its budget begins when it has tours, which take as long as they take.
-        packages: the distributions whose versions belong to a result.
-        programs: names of programs that are used instead where they are on the PATH.
-        weights: the shipped model that it plays, whose hash belongs to a result; None: none.
+        anytime: whether it uses all of its budget; it is then run once for each budget. Other solvers are run once,
+            under a time limit.
+        polishes: whether its budget begins only when it has first tours.
+        packages: distributions whose versions are recorded with a result.
+        programs: programs that are used instead of a package if they are on the PATH.
+        weights: name of the shipped model that it uses, whose hash is recorded with a result.
     """
 
     target: str
@@ -68,10 +68,10 @@ class Solver:
     weights: str | None = None
 
     def load(self) -> Solve:
-        """The function ``solve(instance, seconds, seed)``.
+        """Import the function ``solve(instance, seconds, seed)``.
 
         Raises:
-            ValueError: there is no such module or function.
+            ValueError: the module or the function does not exist.
             Unavailable: the module needs a package that is missing.
         """
         module, _, name = self.target.partition(":")
@@ -86,18 +86,18 @@ class Solver:
         return partial(function, **self.options) if self.options else function
 
     def versions(self) -> dict[str, str]:
-        """What a result depends on: versions of packages; of programs and weights, the beginning of their SHA-256."""
-        found = {"mtsp-env": version.__version__}
+        """What a result depends on: versions of packages, and the beginning of the SHA-256 of programs and weights."""
+        versions = {"mtsp-env": version.__version__}
         for package in self.packages:
             with suppress(metadata.PackageNotFoundError):
-                found[package] = metadata.version(package)
+                versions[package] = metadata.version(package)
         for program in self.programs:
             if path := shutil.which(program):
-                found[program] = _digest(Path(path))
+                versions[program] = _digest(Path(path))
         if self.weights is not None:
             folder = Path(find_spec("dan_policy").origin).parent / "weights"
-            found["weights"] = _digest(folder / f"{self.weights}.safetensors")
-        return found
+            versions["weights"] = _digest(folder / f"{self.weights}.safetensors")
+        return versions
 
 
 def _digest(file: Path) -> str:
@@ -150,10 +150,10 @@ GROUPS: dict[str, tuple[str, ...]] = {
 
 
 def look_up(name: str) -> Solver:
-    """The solver of that name; "package.module:function" names any importable function.
+    """The solver with this name; "package.module:function" names any importable function.
 
     Raises:
-        ValueError: there is no such name.
+        ValueError: the name is unknown.
     """
     if name in SOLVERS:
         return SOLVERS[name]
@@ -165,20 +165,20 @@ def look_up(name: str) -> Solver:
 
 
 def find(name: str) -> Solve:
-    """The function of the solver of that name. Raises as ``look_up`` and ``Solver.load``."""
+    """Import the function of the solver with this name. Raises as ``look_up`` and ``Solver.load``."""
     return look_up(name).load()
 
 
 def expand(names: Iterable[str]) -> list[str]:
-    """Names of solvers, once each and in order, from names of solvers and groups, one by one or joined by commas.
+    """Expand names of solvers and groups, separate or joined by commas, to names of solvers without duplicates.
 
     Raises:
-        ValueError: none, or an unknown one.
+        ValueError: there are no names, or one is unknown.
     """
-    single = [part.strip() for name in names for part in name.split(",") if part.strip()]
-    found = list(dict.fromkeys(solver for name in single for solver in GROUPS.get(name, (name,))))
-    if not found:
+    names = [part.strip() for name in names for part in name.split(",") if part.strip()]
+    expanded = list(dict.fromkeys(solver for name in names for solver in GROUPS.get(name, (name,))))
+    if not expanded:
         raise ValueError(f"name at least one solver; choose from {sorted([*SOLVERS, *GROUPS])}")
-    for name in found:
+    for name in expanded:
         look_up(name)
-    return found
+    return expanded

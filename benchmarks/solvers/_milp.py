@@ -1,4 +1,4 @@
-"""Mixed-integer linear programs, given to HiGHS, Gurobi or CPLEX. Knows nothing of tours."""
+"""Mixed-integer linear programs, solved by HiGHS, Gurobi or CPLEX; independent of tours."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from scipy.sparse import coo_array, csr_array
 
 from benchmarks.solvers import Unavailable
 
-GAP = 1e-7  # relative, between incumbent and bound, at which a solver may stop
-FEASIBILITY = 1e-7  # by how much a solver may break a row or miss a whole number
+GAP = 1e-7  # relative gap between incumbent and bound at which a solver may stop
+FEASIBILITY = 1e-7  # by how much a solver may violate a row or the integrality of a variable
 
 
 @dataclass(frozen=True)
 class Variables:
-    """``cost @ v`` is to be small, ``lower <= v <= upper``, and ``v[binary]`` is 0 or 1; all of shape (k,)."""
+    """Minimise ``cost @ v`` with ``lower <= v <= upper`` and ``v[binary]`` 0 or 1; all of shape (k,)."""
 
     cost: np.ndarray
     lower: np.ndarray
@@ -27,7 +27,7 @@ class Variables:
 
 @dataclass
 class Rows:
-    """``lower <= matrix @ v <= upper``, gathered in blocks of rows."""
+    """Constraints ``lower <= matrix @ v <= upper``, collected in blocks of rows."""
 
     lower: list[np.ndarray] = field(default_factory=list)
     upper: list[np.ndarray] = field(default_factory=list)
@@ -35,7 +35,7 @@ class Rows:
     count: int = 0
 
     def add(self, lower: float | np.ndarray, upper: float | np.ndarray, count: int, *terms: tuple) -> None:
-        """A block of ``count`` rows: the sums of ``terms``, each (row within the block, column, coefficient)."""
+        """Add ``count`` rows, the sums of ``terms``; each term is (row within the block, column, coefficient)."""
         self.lower.append(np.broadcast_to(np.asarray(lower, float), count))
         self.upper.append(np.broadcast_to(np.asarray(upper, float), count))
         for row, column, value in terms:
@@ -44,22 +44,23 @@ class Rows:
         self.count += count
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper, (rows,) each."""
+        """Lower and upper bounds of all rows, (rows,) each."""
         return np.concatenate(self.lower), np.concatenate(self.upper)
 
     def matrix(self, n_columns: int) -> csr_array:
+        """The coefficients, (rows, n_columns)."""
         row, column, value = (np.concatenate(part) for part in zip(*self.terms, strict=True))
         return coo_array((value, (row, column)), shape=(self.count, n_columns)).tocsr()
 
 
-class Found(NamedTuple):
-    """What a solver came to: the best ``values`` (k,), or None, and a ``bound`` that no cost is below."""
+class Result(NamedTuple):
+    """The best ``values`` (k,), or None if there are none, and a lower ``bound`` on the cost."""
 
     values: np.ndarray | None
     bound: float
 
 
-def _highs(variables: Variables, rows: Rows, seconds: float, seed: int, start: np.ndarray | None) -> Found:
+def _highs(variables: Variables, rows: Rows, seconds: float, seed: int, start: np.ndarray | None) -> Result:
     try:
         import highspy
     except ImportError as error:
@@ -98,18 +99,18 @@ def _highs(variables: Variables, rows: Rows, seconds: float, seed: int, start: n
     info = solver.getInfo()
     feasible = info.primal_solution_status == highspy.SolutionStatus.kSolutionStatusFeasible
     values = np.array(solver.getSolution().col_value) if feasible else None
-    return Found(values, info.mip_dual_bound)
+    return Result(values, info.mip_dual_bound)
 
 
 def _by_sense(variables: Variables, rows: Rows) -> list[tuple[str, csr_array, np.ndarray]]:
-    """The rows as (sense, matrix, right side), for solvers that take one side at a time; senses are =, < and >."""
+    """The rows as (sense, matrix, right-hand side), for solvers without two-sided rows; senses are =, < and >."""
     matrix, (lower, upper) = rows.matrix(len(variables.cost)), rows.bounds()
     same = lower == upper
     chosen = {"=": (same, upper), "<": (~same & np.isfinite(upper), upper), ">": (~same & np.isfinite(lower), lower)}
     return [(sense, matrix[mask], side[mask]) for sense, (mask, side) in chosen.items() if mask.any()]
 
 
-def _gurobi(variables: Variables, rows: Rows, seconds: float, seed: int, start: np.ndarray | None) -> Found:
+def _gurobi(variables: Variables, rows: Rows, seconds: float, seed: int, start: np.ndarray | None) -> Result:
     try:
         import gurobipy
     except ImportError as error:
@@ -133,14 +134,14 @@ def _gurobi(variables: Variables, rows: Rows, seconds: float, seed: int, start: 
             if start is not None:
                 v.Start = start
             model.optimize()
-            return Found(v.X if model.SolCount else None, model.ObjBound)
+            return Result(v.X if model.SolCount else None, model.ObjBound)
     except gurobipy.GurobiError as error:
         if error.errno in (gurobipy.GRB.Error.NO_LICENSE, gurobipy.GRB.Error.SIZE_LIMIT_EXCEEDED):
             raise Unavailable(f"Gurobi: {error}") from error
         raise
 
 
-def _cplex(variables: Variables, rows: Rows, seconds: float, seed: int, start: np.ndarray | None) -> Found:
+def _cplex(variables: Variables, rows: Rows, seconds: float, seed: int, start: np.ndarray | None) -> Result:
     try:
         import cplex
     except ImportError as error:
@@ -181,10 +182,10 @@ def _cplex(variables: Variables, rows: Rows, seconds: float, seed: int, start: n
             raise
         solution = model.solution
         values = np.array(solution.get_values()) if solution.is_primal_feasible() else None
-        return Found(values, solution.MIP.get_best_objective())
+        return Result(values, solution.MIP.get_best_objective())
 
 
-BACKENDS: dict[str, Callable[[Variables, Rows, float, int, np.ndarray | None], Found]] = {
+BACKENDS: dict[str, Callable[[Variables, Rows, float, int, np.ndarray | None], Result]] = {
     "highs": _highs,
     "gurobi": _gurobi,
     "cplex": _cplex,
@@ -193,12 +194,12 @@ BACKENDS: dict[str, Callable[[Variables, Rows, float, int, np.ndarray | None], F
 
 def minimise(
     variables: Variables, rows: Rows, seconds: float, seed: int, backend: str, start: np.ndarray | None = None
-) -> Found:
-    """Solve a program on one thread, within ``seconds``, from the feasible values ``start`` (k,) where given.
+) -> Result:
+    """Solve a program on one thread, within ``seconds``, from the feasible values ``start`` (k,) if they are given.
 
     Raises:
         ValueError: an unknown backend.
-        Unavailable: the solver is not installed, has no licence, or takes no program of this size without one.
+        Unavailable: the solver is not installed, has no licence, or its licence does not allow a program of this size.
     """
     if backend not in BACKENDS:
         raise ValueError(f"unknown backend {backend!r}; choose from {sorted(BACKENDS)}")

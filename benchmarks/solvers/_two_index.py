@@ -1,4 +1,4 @@
-"""The two-index program of ``exact`` (whose docstring explains it): from an instance to rows, from values to tours."""
+"""The program that ``exact`` describes: from an instance to variables and rows, and from values back to tours."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from benchmarks.solvers._milp import Rows, Variables
 from mtsp_env.instance import Instance, Tours
 from mtsp_env.tours import lower_bound, makespan
 
-ROUNDING = 1e-6  # by how much more than the limit a tour may have, so that rounding rules none out
+ROUNDING = 1e-6  # by how much tours may exceed the limit, so that rounding excludes none
 
 
 class Program:
-    """Columns: T, then x of each arc, then u of each city.
+    """The program of an instance. Its columns are T, x of each arc, and u of each city.
 
     Attributes:
         variables, rows: the program.
-        start: the given tours as values of the variables, (columns,); None without.
+        start: the tours ``start`` as values of the variables, (columns,), or None.
     """
 
     def __init__(self, instance: Instance, start: Tours | None = None) -> None:
@@ -40,11 +40,11 @@ class Program:
         self.start = None if start is None else self._values(start)
 
     def _arrival(self, city: np.ndarray | int) -> np.ndarray | int:
-        """The column of u."""
+        """The column of a city's u."""
         return len(self.arc) + city
 
     def _cities_apart(self) -> np.ndarray:
-        """Cities of which no two are on one tour, the farthest from the depot first."""
+        """Cities of which no two can be on the same tour, the farthest from the depot first."""
         apart: list[int] = []
         for city in np.argsort(-self.home[1:], kind="stable") + 1:
             if (self.home[city] + self.distance[city, apart] + self.home[apart] > self.limit).all():
@@ -71,7 +71,7 @@ class Program:
         add(-np.inf, 1, len(pair), (row, self.arc[pair], 1), (row, self.arc[back], 1))
 
     def _pairs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Where the arcs between two cities are: (pairs,) those of i -> j with i < j, and those of j -> i."""
+        """Positions of the arcs i -> j between two cities with i < j, and of the arcs j -> i, (pairs,) each."""
         place = np.full((self.n_nodes, self.n_nodes), -1)
         place[self.tail, self.head] = np.arange(len(self.arc))
         pair = np.flatnonzero((self.tail > 0) & (self.tail < self.head))
@@ -99,13 +99,13 @@ class Program:
         add(0, np.inf, len(row), (row, 0, 0.5), (row, self._arrival(self.apart), -1))
 
     def forbid(self, cycles: list[list[int]]) -> None:
-        """No tours within the cities of a cycle: fewer arcs than cities there."""
+        """Forbid tours within the cities of each cycle: fewer arcs than cities."""
         for cycle in cycles:
             within = np.isin(self.tail, cycle) & np.isin(self.head, cycle)
             self.rows.add(-np.inf, len(cycle) - 1, 1, (0, self.arc[within], 1))
 
     def tours(self, values: np.ndarray) -> tuple[Tours, list[list[int]]]:
-        """The tours that ``values`` describe, one per agent, and the cycles, if any, that do not meet the depot."""
+        """The tours that ``values`` describe, one per agent, and the cycles without the depot."""
         taken = values[self.arc] > 0.5
         first, onward = taken & (self.tail == 0), taken & (self.tail > 0)
         after = dict(zip(self.tail[onward].tolist(), self.head[onward].tolist(), strict=True))
@@ -126,11 +126,11 @@ class Program:
         return [[*tour, 0] for tour in tours], cycles
 
     def _values(self, tours: Tours) -> np.ndarray:
-        """``tours`` as values of the variables, each in the direction that the rows ask for."""
+        """``tours`` as values of the variables, each in the direction that the rows allow."""
         values = np.zeros(len(self.variables.cost))
         column = dict(zip(zip(self.tail.tolist(), self.head.tolist(), strict=True), self.arc.tolist(), strict=True))
         for tour in tours:
-            nodes = [0, *(node for node in tour if node != 0), 0]  # passing the depot in between only costs
+            nodes = [0, *(node for node in tour if node != 0), 0]  # visits of the depot on the way are left out
             if len(nodes) == 2:
                 continue
             arrival = np.concatenate([[0.0], np.cumsum(self.distance[nodes[:-1], nodes[1:]])])
@@ -143,13 +143,15 @@ class Program:
 
 
 def greedy_makespan(distance: np.ndarray, n_agents: int) -> float:
-    """Of tours into which the cities are inserted one by one, the farthest first, where the tour stays shortest.
+    """Makespan of greedy insertion: cities, the farthest first, go to the place that gives the shortest tour.
 
-    ``distance``: (n, n), node 0 is the depot.
+    Args:
+        distance: (n, n); node 0 is the depot.
+        n_agents: number of tours.
     """
     n = len(distance)
-    tail, head = np.zeros(n_agents + n - 1, np.int64), np.zeros(n_agents + n - 1, np.int64)  # legs, by their ends,
-    agent = np.concatenate([np.arange(n_agents), np.zeros(n - 1, np.int64)])  # and whose they are
+    tail, head = np.zeros(n_agents + n - 1, np.int64), np.zeros(n_agents + n - 1, np.int64)  # the legs' ends
+    agent = np.concatenate([np.arange(n_agents), np.zeros(n - 1, np.int64)])  # the legs' agents
     length, legs = np.zeros(n_agents), n_agents
     for city in np.argsort(-distance[0, 1:], kind="stable") + 1:
         a, b = tail[:legs], head[:legs]

@@ -1,22 +1,22 @@
-"""An evolutionary algorithm, after Lupoaie, Chili, Breaban, Raschip 2019 (the paper's row "EA").
+"""An evolutionary algorithm in the spirit of Lupoaie, Chili, Breaban, Raschip 2019 (the paper's row "EA").
 
 V.-I. Lupoaie, I.-A. Chili, M. E. Breaban, M. Raschip, "SOM-Guided Evolutionary Search for Solving MinMax
-Multiple-TSP", IEEE CEC 2019, arXiv:1907.11910. Only its abstract and introduction were at hand; neither says how its
-evolutionary algorithm is made, and the DAN paper says nothing either. So every choice below is ours:
+Multiple-TSP", IEEE CEC 2019, arXiv:1907.11910. We had access to its abstract and introduction only. Neither describes
+the evolutionary algorithm, and the DAN paper does not either, so every choice below is ours:
 
-- *Chromosome*: one string of all cities and m - 1 break points, which say where one tour ends and the next begins; two
-  in a row are an idle agent. It is a permutation, so the operators of the TSP serve both halves.
-- *Fitness*: the longest tour, plus a little of the mean tour, without which shortening any other tour counts nothing.
+- *Chromosome*: a permutation of all cities and m - 1 break points. A break point ends one tour and begins the next; two
+  in a row are an idle agent. The operators of the TSP apply to cities and break points alike.
+- *Fitness*: the longest tour plus a fraction of the mean tour, so that shortening any tour is rewarded.
 - *First population*: random permutations.
-- *Parents*: tournaments of two, as many as the population has members.
-- *Crossover* (linear order crossover, Falkenauer and Bouffouix 1991), of 3 in 10 children: a slice of the first parent
-  stays where it is, the rest follows in the second parent's order.
-- *Mutation*, of all children but half of those crossed over: reverse a slice (2-opt; a slice with break points hands
-  cities from tour to tour), move 1 to 3 neighbours elsewhere, or swap two, with equal chances. 7 in 10 bring a random
-  city next to one of its 10 nearest, the others act at random places.
-- *Survivors*: the fittest of parents and children together (so the best is never lost), one of each fitness.
+- *Parents*: winners of tournaments of two, as many as the population has members.
+- *Crossover* (linear order crossover, Falkenauer and Bouffouix 1991), for 3 in 10 children: a slice of the first parent
+  stays in place, and the rest follows in the second parent's order.
+- *Mutation*, for all children except half of those with a crossover: reverse a slice (2-opt; a slice with break points
+  moves cities between tours), move 1 to 3 neighbours elsewhere, or swap two, with equal probability. 7 in 10 bring a
+  random city next to one of its 10 nearest; the others act at random places.
+- *Survivors*: the fittest of parents and children, so that the best is never lost, and one of each fitness.
 
-Everything is done for the whole population at once, with NumPy.
+NumPy applies every step to the whole population at once.
 """
 
 from __future__ import annotations
@@ -31,25 +31,26 @@ from mtsp_env.instance import Instance, Tours
 from mtsp_env.tours import lower_bound
 
 POPULATION = 40
-MEAN_WEIGHT = 0.1  # of the mean tour in the fitness, where the longest has 1
+MEAN_WEIGHT = 0.1  # weight of the mean tour in the fitness; that of the longest is 1
 TOURNAMENT = 2
-CROSSOVER = 0.3  # of the children
-MUTATION_TOO = 0.5  # of the children of a crossover
-NEAR = 0.7  # of the mutations bring a city next to a partner
+CROSSOVER = 0.3  # share of the children with a crossover
+MUTATION_TOO = 0.5  # share of these that are also mutated
+NEAR = 0.7  # share of the mutations that bring a city next to a partner
 N_NEAR = 10
 LONGEST_MOVE = 3  # cities
-SAME = 1e-9  # fitness, but for rounding
-CLOSED = 1e-9  # a makespan this near the lower bound is optimal
+SAME = 1e-9  # difference up to which two fitness values are equal
+TOLERANCE = 1e-9  # a makespan within this of the lower bound is optimal
 
 
 def solve(instance: Instance, seconds: float, seed: int, generations: int | None = None) -> Tours:
-    """Tours of the evolutionary algorithm after ``seconds``, or earlier where they meet the lower bound.
+    """Tours of the evolutionary algorithm after ``seconds``, or earlier if they reach the lower bound.
 
     Args:
-        instance: the problem.
-        seconds: of wall time.
-        seed: of all that is random.
-        generations: stop after so many; where ``seconds`` suffice for them, the result depends on the arguments alone.
+        instance: the instance.
+        seconds: wall time.
+        seed: seed of the random generator.
+        generations: maximum number of generations; if ``seconds`` suffice for them, the result depends on the arguments
+            alone.
 
     Raises:
         ValueError: generations below 0.
@@ -71,23 +72,23 @@ def evolve(
     generations: int | None,
     rng: np.random.Generator,
 ) -> Tours:
-    """The best tours bred from ``population`` until ``end``, or in so many ``generations``.
+    """The best tours bred from ``population``.
 
     Args:
-        instance: the problem.
+        instance: the instance.
         population: int64 (P, L), chromosomes.
-        partners: int64 (n, K), as ``mutate`` takes them.
-        end: of ``time.perf_counter``.
-        generations: None: no limit.
-        rng: for all that is random.
+        partners: int64 (n, K), as for ``mutate``.
+        end: time at which to stop (``time.perf_counter``).
+        generations: maximum number of generations; None for no limit.
+        rng: random generator.
     """
-    optimal = lower_bound(instance) + CLOSED
+    optimal = lower_bound(instance) + TOLERANCE
     distance = symbol_distances(instance)
     longest, fitness = evaluate(population, instance.n_nodes, distance)
     size, done, least, best = len(population), 0, math.inf, population[0]
     while True:
         leader = int(np.argmin(longest))
-        if longest[leader] < least:  # not always the fittest, so that a later generation may not have it
+        if longest[leader] < least:  # it need not be the fittest and may not survive
             least, best = longest[leader], population[leader]
         if least <= optimal or done == generations or time.perf_counter() >= end:
             return decode(best, instance)
@@ -104,12 +105,12 @@ def evolve(
 
 
 def chromosome_length(instance: Instance) -> int:
-    """L: all cities, and a break point between any two agents; agents beyond the number of cities stay at home."""
+    """L: the number of cities and break points. Agents beyond the number of cities stay at home."""
     return instance.n_nodes - 2 + min(instance.n_agents, instance.n_nodes - 1)
 
 
 def encode(tours: Tours, instance: Instance) -> np.ndarray:
-    """The chromosome of ``tours``, int64 (L,); idle agents come last."""
+    """The chromosome of ``tours``, int64 (L,), with idle agents last."""
     breaks = list(range(instance.n_nodes, chromosome_length(instance) + 1))
     string: list[int] = []
     for cities in (tour[1:-1] for tour in tours):
@@ -131,12 +132,12 @@ def decode(chromosome: np.ndarray, instance: Instance) -> Tours:
 
 
 def evaluate(population: np.ndarray, n_nodes: int, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Makespan and fitness of each chromosome, float64 (P,) each; small is fit.
+    """Makespan and fitness of each chromosome, float64 (P,) each; smaller is fitter.
 
     Args:
         population: int64 (P, L).
-        n_nodes: n.
-        distance: float64 (L + 1, L + 1) between symbols, where 0 and the break points stand for the depot.
+        n_nodes: number of nodes.
+        distance: float64 (L + 1, L + 1), between symbols; 0 and the break points stand for the depot.
     """
     size, length = population.shape
     path = np.zeros((size, length + 2), dtype=np.int64)  # from the depot to the depot
@@ -149,14 +150,14 @@ def evaluate(population: np.ndarray, n_nodes: int, distance: np.ndarray) -> tupl
 
 
 def symbol_distances(instance: Instance) -> np.ndarray:
-    """What ``evaluate`` takes, float64 (L + 1, L + 1)."""
+    """The distances between symbols that ``evaluate`` takes, float64 (L + 1, L + 1)."""
     place = np.zeros((chromosome_length(instance) + 1, 2)) + instance.nodes[0]
     place[: instance.n_nodes] = instance.nodes
     return np.linalg.norm(place[:, None] - place, axis=-1)
 
 
 def nearest_partners(instance: Instance) -> np.ndarray:
-    """The nearest cities of each node, int64 (n, K); those of the depot are of no use."""
+    """The nearest cities of each node, int64 (n, K); those of the depot are not used."""
     distance = np.linalg.norm(instance.nodes[:, None] - instance.nodes, axis=-1)
     distance[:, 0] = np.inf
     np.fill_diagonal(distance, np.inf)
@@ -167,7 +168,7 @@ def nearest_partners(instance: Instance) -> np.ndarray:
 
 
 def breed(population: np.ndarray, fitness: np.ndarray, partners: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """As many children as there are members."""
+    """Breed as many children (P, L) as there are members."""
     size, length = population.shape
     children = population[tournament(fitness, size, rng)]
     mutants = np.ones(size, dtype=bool)
@@ -182,27 +183,27 @@ def breed(population: np.ndarray, fitness: np.ndarray, partners: np.ndarray, rng
 
 
 def tournament(fitness: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Numbers of ``count`` members, each the fittest of TOURNAMENT that were drawn."""
+    """Indices of ``count`` members, each the fittest of TOURNAMENT random ones."""
     drawn = rng.integers(len(fitness), size=(count, TOURNAMENT))
     return drawn[np.arange(count), np.argmin(fitness[drawn], axis=1)]
 
 
 def cross(first: np.ndarray, second: np.ndarray, cuts: np.ndarray) -> np.ndarray:
-    """Children (P, L) that hold the slice ``cuts`` (P, 2) of ``first`` and the rest in the order of ``second``."""
+    """Children (P, L) with the slice ``cuts`` (P, 2) of ``first``, and the rest in the order of ``second``."""
     place = np.arange(first.shape[1])
     kept = (place >= cuts[:, :1]) & (place < cuts[:, 1:])  # (P, L)
     is_kept = np.zeros((len(first), first.shape[1] + 1), dtype=bool)  # by symbol
     np.put_along_axis(is_kept, first, kept, axis=1)
     children = first.copy()
-    children[~kept] = second[~np.take_along_axis(is_kept, second, axis=1)]  # row by row, as many in each
+    children[~kept] = second[~np.take_along_axis(is_kept, second, axis=1)]  # equally many in each row
     return children
 
 
 def mutate(parents: np.ndarray, partners: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Mutants (P, L) of ``parents`` (P, L).
 
-    Two places are drawn: at random, or a city's and that of one of its ``partners`` (n, K), cities. The slice from one
-    up to before the other is reversed, or rotated so that its near end meets the other place, or its ends are swapped.
+    Two places are drawn, either at random or as those of a city and one of its ``partners`` (n, K). The slice between
+    them is reversed, or rotated so that its end comes next to the other place, or its two ends are swapped.
     """
     size, length = parents.shape
     each, place = np.arange(size), np.arange(length)
@@ -213,8 +214,8 @@ def mutate(parents: np.ndarray, partners: np.ndarray, rng: np.random.Generator) 
         wanted = partners[symbol[near], rng.integers(partners.shape[1], size=len(near))]
         other[near] = np.argmax(parents[near] == wanted[:, None], axis=1)
 
-    after = rng.integers(2, size=size)  # the slice is after the first of the two places, or before the second
-    begin, end = np.minimum(one, other) + after, np.maximum(one, other) + after  # the slice; empty where they are one
+    after = rng.integers(2, size=size)  # the slice excludes the first place, or the second
+    begin, end = np.minimum(one, other) + after, np.maximum(one, other) + after  # empty if the places are the same
     moved = rng.integers(1, LONGEST_MOVE + 1, size=size)
     shift = np.where(after, -moved, moved)
     kind = rng.integers(3, size=size)
@@ -228,7 +229,7 @@ def mutate(parents: np.ndarray, partners: np.ndarray, rng: np.random.Generator) 
 
 
 def survivors(fitness: np.ndarray, count: int) -> np.ndarray:
-    """Numbers of the ``count`` fittest, best first; of those with one fitness the second and later come last."""
+    """Indices of the ``count`` fittest, best first; duplicates in fitness come last."""
     order = np.argsort(fitness, kind="stable")
     first = np.diff(fitness[order], prepend=-np.inf) > SAME
     return np.concatenate([order[first], order[~first]])[:count]

@@ -1,23 +1,23 @@
 """LKH-3 (Helsgaun 2017, An extension of the Lin-Kernighan-Helsgaun TSP solver for constrained TSP and VRP problems).
 
-The program ``LKH`` is used where there is one on the PATH, else the LKH 3.0.8 inside the package ``elkai``. Settings,
-all others being LKH's own:
+The program ``LKH`` is used if it is on the PATH, otherwise the LKH 3.0.8 inside the package ``elkai``. Settings that
+differ from LKH's defaults:
 
-- ``SPECIAL``: the moves and kicks that LKH-3 has for such problems. Without it, three of four instances of n = 50
-  end without tours after 1 s.
-- One run of as many trials as there is time for, ended early where the longest tour is the farthest out-and-back trip
-  (``OPTIMUM``), which none can beat. The default, runs of n trials crossed with each other, was not better.
-- ``MTSP_MIN_SIZE = 0``: agents may stay at home. As they can take a city off another's tour at no cost, the default,
-  1, would not change the optimum; it changes nothing that we could measure either.
+- ``SPECIAL``: the moves and kicks that LKH-3 has for such problems. Without it, three of four instances of n = 50 have
+  no tours after 1 s.
+- One run with as many trials as its time allows. It ends early if the longest tour is the farthest out-and-back trip
+  (``OPTIMUM``), which is a lower bound. The default, runs of n trials that are crossed with each other, was not better.
+- ``MTSP_MIN_SIZE = 0``: agents may stay at home. The default, 1, has the same optimum, because an idle agent can take
+  over a city at no cost; the measured difference was none.
 - ``INITIAL_TOUR_ALGORITHM = MTSP`` (Soylu 2015) and ``INITIAL_PERIOD = 100`` (of the ascent; default n / 2): the first
-  tours come sooner, at n = 1000 after 1.3 s instead of 2.9 s; the last ones are as good, within the noise of 8
+  tours come earlier, at n = 1000 after 1.3 s instead of 2.9 s; the last ones are as good, within the noise of 8
   instances of n = 100 and 200.
-- Lengths are whole millionths of the unit square's side, as LKH knows integers only. The makespan that LKH sees is off
-  by about 1e-6 of its value.
+- Lengths are whole millionths of the unit square's side, because LKH's lengths are integers. LKH's makespan differs
+  from the true one by about 1e-6 of its value.
 
-LKH counts seconds of processor time, and does not look at them while it prepares (0.4 s at n = 1000). Hence it runs in
-a process of its own, killed a little after its time, and each better tour that a trial ends with is read from a file.
-Where the first trial does not end in time, there are no tours.
+LKH measures CPU time, and does not check it during its preparation (0.4 s at n = 1000). Hence it runs in a process of
+its own, which is killed shortly after its time, and the improved tours of each trial are read from a file. If the first
+trial does not end in time, there are no tours.
 """
 
 from __future__ import annotations
@@ -39,42 +39,42 @@ from mtsp_env.instance import Instance, Tours
 from mtsp_env.tours import makespan
 
 UNIT = 1_000_000  # LKH's lengths per side of the unit square
-GRACE = 0.1, 0.2  # killed after this fraction of its time, and these seconds, more
-MANY = 10**9  # trials, where time alone limits them
-SEEDS = 2**31 - 1  # LKH's: 1 to this; it takes 0 for the clock
+GRACE_SHARE, GRACE_SECONDS = 0.1, 0.2  # LKH is killed after this share of its time plus these seconds beyond it
+UNLIMITED_TRIALS = 10**9  # time is the only limit
+N_SEEDS = 2**31 - 1  # LKH's seeds are 1 to this; 0 means the clock
 CHILD = Path(__file__).with_name("_lkh_child.py")
 
 
-def solve(instance: Instance, seconds: float, seed: int, trials: int = MANY) -> Tours:
-    """Tours by LKH-3 on one thread, within ``seconds``, or for at most ``trials`` trials.
+def solve(instance: Instance, seconds: float, seed: int, trials: int = UNLIMITED_TRIALS) -> Tours:
+    """Tours by LKH-3 on one thread, within ``seconds`` and after at most ``trials`` trials.
 
-    They depend on nothing but instance, seed and trials where LKH comes to an end in time.
+    If LKH finishes its trials in time, the tours depend on the arguments alone.
 
     Raises:
-        Unavailable: neither LKH nor the package elkai is here.
+        Unavailable: neither the program LKH nor the package elkai is installed.
         NoTours: the first trial was not done in time.
-        RuntimeError: LKH failed; the message holds what it said.
+        RuntimeError: LKH failed; the message ends with the last line of its standard error.
     """
     end = time.monotonic() + seconds
     program = _program()
-    if instance.n_nodes == 2:  # LKH takes at least 3
+    if instance.n_nodes == 2:  # LKH needs at least 3
         return [[0, 1, 0], *([0, 0] for _ in range(instance.n_agents - 1))]
     with tempfile.TemporaryDirectory(prefix="lkh3-") as folder:
         Path(folder, "parameters").write_text(_parameters(instance, seed, trials))
         Path(folder, "problem").write_text(_problem(instance))
-        _run(program, folder, end, seconds * GRACE[0] + GRACE[1])
+        _run(program, folder, end, GRACE_SHARE * seconds + GRACE_SECONDS)
         texts = [file.read_text() for file in Path(folder).glob("*.tour")]
-    found = [_read(text, instance) for text in texts if text.endswith("EOF\n")]  # a kill may leave half a file
-    if not found:
+    candidates = [_read(text, instance) for text in texts if text.endswith("EOF\n")]  # a kill can leave half a file
+    if not candidates:
         raise NoTours(f"LKH's first trial was not done in {seconds:g} s")
-    return min(found, key=lambda tours: makespan(instance, tours))
+    return min(candidates, key=lambda tours: makespan(instance, tours))
 
 
 def _program() -> str:
-    """The path of LKH; empty: the one inside elkai."""
+    """The path of LKH; empty for the one inside elkai."""
     program = shutil.which("LKH")
     if program is None and find_spec("elkai") is None:
-        raise Unavailable("neither the program LKH nor the package elkai is here")
+        raise Unavailable("neither the program LKH nor the package elkai is installed")
     return os.path.abspath(program) if program else ""
 
 
@@ -83,7 +83,7 @@ def _grid(instance: Instance) -> np.ndarray:
 
 
 def _parameters(instance: Instance, seed: int, trials: int) -> str:
-    n_agents = min(instance.n_agents, instance.n_nodes - 1)  # LKH takes no more agents than cities
+    n_agents = min(instance.n_agents, instance.n_nodes - 1)  # LKH accepts at most as many agents as cities
     grid = _grid(instance)
     farthest = math.floor(np.hypot(*(grid - grid[0]).T).max() + 0.5)  # rounded as in TSPLIB's EUC_2D
     settings = {
@@ -93,11 +93,11 @@ def _parameters(instance: Instance, seed: int, trials: int) -> str:
         "INITIAL_PERIOD": 100,
         "RUNS": 1,
         "MAX_TRIALS": trials,
-        "SEED": seed % SEEDS + 1,
+        "SEED": seed % N_SEEDS + 1,
         "TRACE_LEVEL": 0,
-        "OUTPUT_TOUR_FILE": "$.tour",  # $: the tour's cost, so that a better one overwrites none
+        "OUTPUT_TOUR_FILE": "$.tour",  # $ is the tour's cost, so that no file is overwritten
     }
-    if n_agents > 1:  # LKH hangs on MTSP for one agent, and its optimum is rarely that trip
+    if n_agents > 1:  # LKH hangs on MTSP with one agent, and its optimum is rarely that trip
         settings |= {"INITIAL_TOUR_ALGORITHM": "MTSP", "OPTIMUM": 2 * farthest}
     return "SPECIAL\n" + "".join(f"{name} = {value}\n" for name, value in settings.items())
 
@@ -108,7 +108,7 @@ def _problem(instance: Instance) -> str:
 
 
 def _run(program: str, folder: str, end: float, grace: float) -> None:
-    """Run LKH in ``folder`` until it ends, or ``grace`` seconds after ``end`` at the latest."""
+    """Run LKH in ``folder``; kill it ``grace`` seconds after ``end``."""
     command = [sys.executable, str(CHILD), str(os.getpid()), repr(end), *([program] if program else [])]
     try:
         done = subprocess.run(
@@ -123,12 +123,12 @@ def _run(program: str, folder: str, end: float, grace: float) -> None:
     except subprocess.TimeoutExpired:
         return
     if done.returncode:
-        said = done.stderr.decode(errors="replace").strip().splitlines()
-        raise RuntimeError(f"LKH ended with code {done.returncode}: {said[-1] if said else 'it said nothing'}")
+        lines = done.stderr.decode(errors="replace").strip().splitlines() or ["no message"]
+        raise RuntimeError(f"LKH ended with code {done.returncode}: {lines[-1]}")
 
 
 def _read(text: str, instance: Instance) -> Tours:
-    """The tours in a TSPLIB tour file, where node 1 and those beyond n are the depot."""
+    """The tours in a TSPLIB tour file, in which node 1 and the nodes beyond n are the depot."""
     numbers = [int(word) - 1 for word in text.partition("TOUR_SECTION")[2].split()[:-2]]  # without -1 and EOF
     nodes = [number if number < instance.n_nodes else 0 for number in numbers]
     start = nodes.index(0)

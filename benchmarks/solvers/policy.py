@@ -1,12 +1,13 @@
-"""Policies played in the environment: the shipped DAN and the two that every learned one must beat.
+"""Policies as solvers: the shipped DAN, and the two that a trained policy must beat.
 
-All on the CPU, as every other solver: times are to be compared.
+They run on the CPU, as all other solvers do, so that times can be compared.
 """
 
 from __future__ import annotations
 
-from benchmarks.policies import nearest as simple
-from dan_policy import solve as play
+from benchmarks.policies import nearest as policies
+from dan_policy import SolveOptions
+from dan_policy import solve as solve_with
 from mtsp_env.instance import Instance, Tours
 
 
@@ -18,25 +19,26 @@ def dan(
     augment: bool = False,
     policy: str = "default",
 ) -> Tours:
-    """The shipped DAN, greedy (``samples`` None) or the best of ``samples`` (paper, Sec. 6). Ignores ``seconds``.
+    """Tours by a shipped DAN, greedy or the best of ``samples`` (paper, Sec. 6); ``seconds`` is ignored.
 
-    ``augment``: in the square's symmetries.
+    With ``augment`` the instance is solved in the eight symmetries of the square.
     """
+    options = SolveOptions(augment=augment, seed=seed, device="cpu")
     if samples is None:
-        return play(instance, policy, augment=augment, device="cpu").tours
-    return play(instance, policy, decode="sample", samples=samples, seed=seed, device="cpu", augment=augment).tours
+        return solve_with(instance, policy, options).tours
+    return solve_with(instance, policy, options, decode="sample", samples=samples).tours
 
 
 def improved_dan(instance: Instance, seconds: float, seed: int, policy: str = "default") -> Tours:
-    """The shipped DAN, greedy, its tours polished by the reference solver for ``seconds`` after that."""
-    return play(instance, policy, seed=seed, device="cpu", improve=seconds).tours
+    """Greedy tours by a shipped DAN, improved by the reference solver for ``seconds``."""
+    return solve_with(instance, policy, seed=seed, device="cpu", improve=seconds).tours
 
 
 def nearest(instance: Instance, seconds: float, seed: int) -> Tours:
-    """Each agent goes to the nearest unvisited city. Ignores ``seconds``."""
-    return play(instance, simple.nearest, device="cpu").tours
+    """Tours of agents that go to the nearest unvisited city; ``seconds`` is ignored."""
+    return solve_with(instance, policies.nearest, device="cpu").tours
 
 
 def uniformly_random(instance: Instance, seconds: float, seed: int) -> Tours:
-    """One game of uniformly random legal actions. Ignores ``seconds``."""
-    return play(instance, simple.uniformly_random, decode="sample", samples=1, seed=seed, device="cpu").tours
+    """Tours of one episode of uniformly random legal actions; ``seconds`` is ignored."""
+    return solve_with(instance, policies.uniformly_random, decode="sample", samples=1, seed=seed, device="cpu").tours

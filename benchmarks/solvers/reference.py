@@ -1,4 +1,4 @@
-"""The reference solver: ruin and recreate, near-optimal in milliseconds to seconds."""
+"""The reference solver of ``mtsp_env``: ruin and recreate, near-optimal in milliseconds to seconds."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from mtsp_env.instance import Instance, Tours
 
 
 def solve(instance: Instance, seconds: float, seed: int) -> Tours:
-    """``mtsp_env.reference.improve`` from greedy insertion, for ``seconds``."""
-    from mtsp_env.reference import improve  # numba: only where it is needed
+    """Tours by ``mtsp_env.reference.improve`` after ``seconds``, from greedy insertion."""
+    from mtsp_env.reference import improve  # imports Numba
 
     return improve(instance, seconds=seconds, seed=seed)

@@ -1,23 +1,24 @@
-"""Self-organising maps, alone and as guides of the evolutionary algorithm, after Lupoaie et al. 2019.
+"""Self-organising maps, alone and as the start of the evolutionary algorithm, after Lupoaie et al. 2019.
 
-The article (named in full in ``ea.py``) puts solutions of self-organising maps before an evolutionary algorithm and an
-ant colony. Only its abstract and introduction were at hand, so that the maps are built as in S. Somhom, A. Modares, T.
-Enkawa, "Competition-based neural network for the multiple travelling salesmen problem with minmax objective", Computers
-& Operations Research 26 (1999), as we know that method, and how they guide is our choice:
+The article (reference in ``ea.py``) starts an evolutionary algorithm and an ant colony from self-organising maps. We
+had access to its abstract and introduction only. The maps here follow S. Somhom, A. Modares, T. Enkawa,
+"Competition-based neural network for the multiple travelling salesmen problem with minmax objective", Computers &
+Operations Research 26 (1999); how they start the evolution is our choice:
 
-- One closed ring of neurons for each agent, 2.5 neurons for each city of a fair share. The first neuron of each ring
-  stays at the depot; the rings begin as small circles through it, in directions spread evenly from a random one.
-- In an epoch every city is shown once, in random order. The neuron with the smallest distance * (its ring's length /
-  the rings' mean length) wins, so that long rings win less; in one epoch a neuron wins at most one city. The winner and
-  its neighbours on the ring, d neurons away, move towards the city by 0.6 exp(-(d / width)^2) of the way. The width
-  shrinks geometrically from a fifth of the ring to 0.3 neurons in 100 epochs, or in fewer where time is short.
+- Each agent has a closed ring of neurons, 2.5 for each city of a fair share. The first neuron of a ring stays at the
+  depot. The rings begin as small circles through the depot, in evenly spread directions.
+- In an epoch every city is presented once, in random order. The neuron with the smallest distance * (length of its ring
+  / mean length of the rings) wins, so that long rings win less often; in one epoch a neuron wins at most one city. The
+  winner and its neighbours on the ring, d neurons away, move towards the city by 0.6 exp(-(d / width)^2) of the
+  distance. The width shrinks geometrically from a fifth of the ring to 0.3 neurons in 100 epochs, or in fewer if time
+  is short.
 - A ring's tour is the order of the neurons that won in the last epoch. No local search follows.
-- Alone (``guided=False``): one map after the other, until the time is over; the best tours count. The DAN paper's row
-  "SOM" is of this kind: its time does not grow with the agents, as that of its row "EA" does, and its tours are worse
-  than those of "EA" at n = 50, which no seeded evolution would allow.
-- Guided (``guided=True``, the article's subject): the evolutionary algorithm of ``ea.py``, whose first population are
-  the tours of maps trained for up to 0.3 of the time, and mutants of them where they are too few. (Mutations that bring
-  a city next to one beside which a map has put it, in place of one of its nearest, did not help.)
+- Alone (``guided=False``): maps are trained one after the other until time is up, and the best tours count. The DAN
+  paper's row "SOM" is probably of this kind: its time does not grow with the number of agents, unlike that of its row
+  "EA", and at n = 50 its tours are worse than those of "EA", which an evolution started from maps would improve on.
+- Guided (``guided=True``, the article's subject): the evolutionary algorithm of ``ea.py``. Its first population are the
+  tours of maps trained for up to 0.3 of the time, and mutants of them if they are too few. (Mutations that bring a city
+  next to its neighbour on a map, instead of one of its nearest cities, did not help.)
 """
 
 from __future__ import annotations
@@ -36,13 +37,13 @@ from mtsp_env.checks import check_count
 from mtsp_env.instance import Instance, Tours
 from mtsp_env.tours import lower_bound, makespan
 
-NEURONS = 2.5  # for each city of an agent's fair share
-RADIUS = 0.1  # of the first rings, in units of the farthest city's distance to the depot
+NEURONS = 2.5  # per city of an agent's fair share
+RADIUS = 0.1  # of the initial rings, relative to the farthest city's distance from the depot
 EPOCHS = 100
-WIDE, NARROW = 0.2, 0.3  # first width, in units of a ring; last width, in neurons
-RATE = 0.6  # of the way to the city
-REACH = 3.0  # widths; neurons farther away stay where they are
-MAP_SHARE = 0.3  # of the time, for the maps that guide
+WIDE, NARROW = 0.2, 0.3  # initial width, relative to the ring; final width, in neurons
+RATE = 0.6  # share of the distance to the city by which the winner moves
+REACH = 3.0  # in widths; neurons farther from the winner do not move
+MAP_SHARE = 0.3  # share of the time for maps, if guided
 
 
 def solve(
@@ -53,16 +54,17 @@ def solve(
     maps: int | None = None,
     generations: int | None = None,
 ) -> Tours:
-    """Tours after ``seconds``, or earlier where they meet the lower bound.
+    """Tours after ``seconds``, or earlier if they reach the lower bound.
 
     Args:
-        instance: the problem.
-        seconds: of wall time. One map is always trained, two epochs at least; compiling its kernel does not count.
-        seed: of all that is random.
-        guided: let the maps guide the evolutionary algorithm; otherwise they are all.
-        maps: so many at most; None: as many as the population has members, or, not guided, any number.
-        generations: so many at most. Where ``seconds`` suffice for them and for the maps, the result depends on the
-            arguments alone.
+        instance: the instance.
+        seconds: wall time. One map is always trained for at least two epochs; the compilation of its kernel is not
+            counted.
+        seed: seed of the random generator.
+        guided: start the evolutionary algorithm from the maps; otherwise there are only maps.
+        maps: maximum number of maps; by default the size of the population if guided, else no limit.
+        generations: maximum number of generations. If ``seconds`` suffice for them and for the maps, the result depends
+            on the arguments alone.
 
     Raises:
         ValueError: maps below 1, or generations below 0.
@@ -76,20 +78,20 @@ def solve(
     if not guided:
         return min(train_maps(instance, started + seconds, maps, rng), key=lambda tours: makespan(instance, tours))
 
-    found = list(train_maps(instance, started + MAP_SHARE * seconds, min(maps or math.inf, ea.POPULATION), rng))
-    chromosomes = np.array([ea.encode(tours, instance) for tours in found])
+    tours = list(train_maps(instance, started + MAP_SHARE * seconds, min(maps or math.inf, ea.POPULATION), rng))
+    chromosomes = np.array([ea.encode(one, instance) for one in tours])
     partners = ea.nearest_partners(instance)
-    population = np.resize(chromosomes, (ea.POPULATION, chromosomes.shape[1]))  # over and over again
-    population[len(found) :] = ea.mutate(population[len(found) :], partners, rng)
+    population = np.resize(chromosomes, (ea.POPULATION, chromosomes.shape[1]))  # repeated
+    population[len(tours) :] = ea.mutate(population[len(tours) :], partners, rng)
     return ea.evolve(instance, population, partners, started + seconds, generations, rng)
 
 
 def train_maps(instance: Instance, end: float, count: float | None, rng: np.random.Generator) -> Iterator[Tours]:
-    """The tours of maps trained until ``end`` (of ``time.perf_counter``), at least one and at most ``count``.
+    """Yield the tours of at least one and at most ``count`` maps, trained until ``end`` (``time.perf_counter``).
 
-    The first has fewer epochs where time is short, a later one is given up. The lower bound ends it all.
+    If time is short, the first map has fewer epochs, and a later one is abandoned. It stops at the lower bound.
     """
-    optimal = lower_bound(instance) + ea.CLOSED
+    optimal = lower_bound(instance) + ea.TOLERANCE
     for number in itertools.count():
         if number == count or (number and time.perf_counter() >= end):
             return
@@ -102,7 +104,7 @@ def train_maps(instance: Instance, end: float, count: float | None, rng: np.rand
 
 
 def train(instance: Instance, end: float, hurry: bool, rng: np.random.Generator) -> Tours | None:
-    """The tours of one map; if ``end`` comes too soon, after fewer epochs where there is ``hurry``, else None."""
+    """The tours of one map. If time is short, it has fewer epochs with ``hurry``, and without it there are none."""
     nodes, n_cities = instance.nodes, instance.n_nodes - 1
     rings = first_rings(nodes, min(instance.n_agents, n_cities), rng)  # (m, k, 2)
     lengths = np.ones(len(rings))
@@ -126,7 +128,7 @@ def train(instance: Instance, end: float, hurry: bool, rng: np.random.Generator)
 
 
 def first_rings(nodes: np.ndarray, n_agents: int, rng: np.random.Generator) -> np.ndarray:
-    """Small circles through the depot, float64 (m, k, 2); the first neuron of each is at the depot."""
+    """Small circles through the depot, float64 (m, k, 2); their first neurons are at the depot."""
     size = 1 + math.ceil(NEURONS * (len(nodes) - 1) / n_agents)  # k
     radius = RADIUS * np.linalg.norm(nodes - nodes[0], axis=1).max()
     outwards = 2 * np.pi * (rng.random() + np.arange(n_agents) / n_agents)[:, None]  # (m, 1)
@@ -139,15 +141,15 @@ def first_rings(nodes: np.ndarray, n_agents: int, rng: np.random.Generator) -> n
 def show(
     nodes: np.ndarray, order: np.ndarray, rings: np.ndarray, lengths: np.ndarray, winner: np.ndarray, width: float
 ) -> None:
-    """One epoch: show the cities in ``order``, moving ``rings``; ``winner`` says which neuron each city has now.
+    """Run one epoch: present the cities in ``order``, move ``rings`` and record the winners.
 
     Args:
         nodes: float64 (n, 2).
-        order: int64 (n - 1,), the cities.
-        rings: float64 (m, k, 2), changed. The first neuron of each does not move and does not win.
-        lengths: float64 (m,) of the rings, changed.
-        winner: int64 (n,), changed: ring * k + neuron.
-        width: of the neighbourhood, in neurons.
+        order: int64 (n - 1,), the cities in random order.
+        rings: float64 (m, k, 2), changed in place. The first neuron of each neither moves nor wins.
+        lengths: float64 (m,), lengths of the rings, changed in place.
+        winner: int64 (n,), changed in place: each city's ring * k + neuron.
+        width: width of the neighbourhood, in neurons.
     """
     n_rings, size = rings.shape[:2]
     reach = min(int(REACH * width), (size - 1) // 2)
@@ -180,5 +182,5 @@ def show(
 
 @functools.cache
 def _compile() -> None:
-    """Have the kernel compiled, or loaded from disk, before a clock runs."""
+    """Compile the kernel, or load it from disk, before the clock starts."""
     train(Instance([[0.0, 0.0], [1.0, 0.0]], 1), math.inf, False, np.random.default_rng(0))

@@ -1,6 +1,6 @@
-"""A search of the reference solver: its arrays from an instance, from tours and from prefixes, and tours from them.
+"""The arrays of a search: made from an instance, tours and prefixes, and turned back into tours.
 
-``sisr`` holds what is compiled, ``solver`` what is called.
+``solver`` calls these functions and the compiled kernels in ``sisr``.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from mtsp_env.tours import is_closed
 
 
 def new_search(nodes: np.ndarray, n_agents: int, seed: int) -> sisr.Search:
-    """A search over ``nodes`` (n, 2) whose tours are empty."""
+    """A search over ``nodes`` (n, 2) with empty tours."""
     n, size = len(nodes), len(nodes) + n_agents
     xy = np.concatenate([nodes, np.repeat(nodes[:1], n_agents, axis=0)])  # (N, 2)
     x, y = np.ascontiguousarray(xy[:, 0]), np.ascontiguousarray(xy[:, 1])
@@ -43,8 +43,11 @@ def new_search(nodes: np.ndarray, n_agents: int, seed: int) -> sisr.Search:
     )
 
 
-def set_off(search: sisr.Search, prefixes: Tours, driven: np.ndarray) -> None:
-    """Put the agents where their ``prefixes`` end: nodes 1, 2, ... of ``search`` are the last ones that are cities."""
+def place_agents(search: sisr.Search, prefixes: Tours, driven: np.ndarray) -> None:
+    """Put each agent where its prefix ends, ``driven`` (m,) from the depot.
+
+    Nodes 1, 2, ... of ``search`` must be the last cities of the prefixes that end at a city, in the agents' order.
+    """
     depot, head, order = len(search.near), 1, []
     for agent, prefix in enumerate(prefixes):
         if prefix[-1] != 0:
@@ -58,15 +61,18 @@ def set_off(search: sisr.Search, prefixes: Tours, driven: np.ndarray) -> None:
     sisr.load_tours(search, np.array(order, dtype=np.int64))
 
 
-def rest_as_order(tours: Tours, prefixes: Tours, kept: list[int]) -> np.ndarray:
-    """What is left of ``tours``, which begin with ``prefixes``, as ``sisr.load_tours`` takes it."""
-    number = {node: i for i, node in enumerate(kept)}
+def remaining_order(tours: Tours, prefixes: Tours, remaining: list[int]) -> np.ndarray:
+    """The part of ``tours`` after ``prefixes`` in the form of ``sisr.load_tours``, int64 (len(remaining) - 1 + m,).
+
+    Node i of the search is node ``remaining[i]`` of the tours.
+    """
+    number = {node: i for i, node in enumerate(remaining)}
     rests = [tour[max(0, len(prefix) - 1) :] for tour, prefix in zip(tours, prefixes, strict=True)]
     return np.array([i for rest in rests for i in [*(number[node] for node in rest if node != 0), 0]], dtype=np.int64)
 
 
 def _spread(seed: int) -> int:
-    """Neighbouring seeds, spread over 64 bits (splitmix64); never 0."""
+    """A seed spread over 64 bits, so that neighbouring seeds differ in many of them (splitmix64); never 0."""
     z = (seed + 0x9E3779B97F4A7C15) % 2**64
     z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9 % 2**64
     z = (z ^ (z >> 27)) * 0x94D049BB133111EB % 2**64
@@ -74,9 +80,9 @@ def _spread(seed: int) -> int:
 
 
 def as_order(tours: Tours, size: int) -> np.ndarray:
-    """``tours`` as ``sisr.load_tours`` takes them, int64 (size,): idle agents last.
+    """``tours`` in the form of ``sisr.load_tours``, int64 (size,), with idle agents last.
 
-    Passing the depot in between only makes a tour longer, so it is left out.
+    Visits to the depot in the middle of a tour are left out: they only make it longer.
     """
     cities = [[node for node in tour if node != 0] for tour in tours]
     order = [node for tour in cities if tour for node in [*tour, 0]]
@@ -84,7 +90,7 @@ def as_order(tours: Tours, size: int) -> np.ndarray:
 
 
 def as_tours(order: np.ndarray, n_agents: int) -> Tours:
-    """Tours from ``sisr.best_order``; agents that it leaves out stay at home."""
+    """Tours from the result of ``sisr.best_order``; agents beyond those of the search stay at home."""
     tours: Tours = [[0]]
     for node in order.tolist():
         tours[-1].append(node)

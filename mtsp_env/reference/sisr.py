@@ -1,18 +1,19 @@
 """Kernels of the reference solver: ruin and recreate by string removals (SISR), compiled with Numba.
 
-After Christiaens & Vanden Berghe 2020, "Slack Induction by String Removals for Vehicle Routing Problems", with the
-MinMax mTSP's objective: the makespan plus ``TOTAL_WEIGHT`` times the total length. An iteration removes strings of
-neighbouring cities from a few tours, puts them back greedily, and keeps the result or undoes it (simulated annealing).
+Source: Christiaens & Vanden Berghe 2020, "Slack Induction by String Removals for Vehicle Routing Problems". The
+objective here is that of the MinMax mTSP: the makespan plus ``TOTAL_WEIGHT`` times the total length. An iteration
+removes strings of neighbouring cities from a few tours and puts the cities back greedily; simulated annealing keeps the
+result or undoes it.
 
-An iteration does O(m) work and none that grows with n: cities go next to one of their ``N_NEAR`` nearest cities or next
-to the depot, lengths are kept up to date, a rejected change is undone from a log, and tours are linked lists. In these,
-nodes 1..n-1 are the cities, and node n + a is agent a's own copy of the depot, both the start and the end of its tour;
-node 0 is unused.
+An iteration takes O(m) time, independent of n: a city goes next to one of its ``N_NEAR`` nearest cities or next to the
+depot, lengths are kept up to date, rejected changes are undone from a log, and tours are linked lists. In these lists
+nodes 1..n-1 are the cities. Node n + a is agent a's own copy of the depot, both the start and the end of its tour. Node
+0 is unused.
 
-An agent that is under way has a head: the city that it is going to, behind all that it has driven. The leg to it has
-the length -inf, so that no detour before it is ever the cheapest place, without a question in the inner loop.
+An agent that is under way has a *head*: the city that it is at or going to, the last one that is fixed. The leg to a
+head has length -inf, so that the place before it is never the cheapest; the inner loop needs no test for heads.
 
-The kernels share one file because Numba's cache on disk sees no change in other files than a compiled function's own.
+All kernels are in this file because Numba's cache on disk notices changes only in a compiled function's own file.
 """
 
 from __future__ import annotations
@@ -23,57 +24,57 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-# Chosen on uniform instances of 50 to 1000 nodes; half or twice of any of them changes little, but for N_NEAR.
-TOTAL_WEIGHT = 0.01  # of the total length against the makespan
-N_NEAR = 40  # a city's nearest cities, next to which it may go: half of them are off their tours when it is its turn
-MEAN_REMOVED = 10.0  # cities per iteration, about (the paper's c-bar)
-MAX_STRING = 10.0  # cities of one string (the paper's L-max)
-SPLIT_CHANCE = 0.5  # that a string leaves some cities in its middle (the paper's alpha)
-LEAVE_CHANCE = 0.5  # that it leaves one more
-LONGEST_CHANCE = 0.5  # that the first string is of the longest tour, which alone sets the makespan
+# Chosen on uniform instances of 50 to 1000 nodes. Halving or doubling any of them changes little, except N_NEAR.
+TOTAL_WEIGHT = 0.01  # of the total length, relative to the makespan
+N_NEAR = 40  # nearest cities next to which a city may go; about half of them are removed when it is put back
+MEAN_REMOVED = 10.0  # cities removed per iteration, approximately (the paper's c-bar)
+MAX_STRING = 10.0  # largest number of cities in a string (the paper's L-max)
+SPLIT_CHANCE = 0.5  # that a string keeps some cities in its middle (the paper's alpha)
+LEAVE_CHANCE = 0.5  # that it keeps one more
+LONGEST_CHANCE = 0.5  # that the first string is from the longest tour, which alone sets the makespan
 BALANCE_CHANCE = 0.5  # that cities go where the tour stays shortest, not where the objective grows least
-BLINK = 300  # the places next to a city are overlooked once in so many times
-REFRESH = 4096  # iterations after which the lengths are summed afresh, against drift
-FINE = 1e-12  # lengths closer than this are equal
+BLINK = 300  # each nearest city is overlooked as a place with a chance of 1 / BLINK
+REFRESH = 4096  # iterations after which the lengths are summed again, to remove rounding errors
+TOLERANCE = 1e-12  # lengths closer than this are equal
 
 
 class Search(NamedTuple):
-    """What a search holds: N = n + m nodes (m copies of the depot at the end), K = min(N_NEAR, n - 2)."""
+    """The arrays of a search: N = n + m nodes (m copies of the depot at the end), K = min(N_NEAR, n - 2)."""
 
     x: np.ndarray  # (N,) float64
     y: np.ndarray  # (N,) float64
-    near: np.ndarray  # (n, K) int64, a city's nearest cities, nearest first
+    near: np.ndarray  # (n, K) int64, each city's nearest cities, nearest first
     near_distance: np.ndarray  # (n, K) float64
     previous: np.ndarray  # (N,) int32
     next: np.ndarray  # (N,) int32
     leg: np.ndarray  # (N,) float64, distance from the previous node
-    tour: np.ndarray  # (N,) int32, the agent; -1: on no tour
-    length: np.ndarray  # (m,) float64, of each tour
+    tour: np.ndarray  # (N,) int32, the agent on whose tour the node is; -1: on none
+    length: np.ndarray  # (m,) float64, length of each tour
     n_movable: np.ndarray  # (m,) int32, cities on each tour that may be moved: all but the head
-    head: np.ndarray  # (m,) int32, the tour's first city where it must stay so; the agent's depot: closed; 0: free
-    driven: np.ndarray  # (m,) float64, length of the tour as far as the head
-    ruined: np.ndarray  # (m,) int64, the iteration that last took a string from the tour
+    head: np.ndarray  # (m,) int32, the fixed first city of each tour; 0: none; the agent's depot: the tour is closed
+    driven: np.ndarray  # (m,) float64, length of each tour up to its head
+    ruined: np.ndarray  # (m,) int64, the last iteration that removed a string from the tour
     best: np.ndarray  # (N,) int32, ``next`` of the best tours so far
-    random: np.ndarray  # (1,) uint64, state of the random numbers, not 0
+    random: np.ndarray  # (1,) uint64, state of the random number generator, not 0
     city_log: np.ndarray  # (2, n) int32, cities removed (row 0) and put back (row 1), in order
     place_log: np.ndarray  # (n,) int32, the node before each removed city
     tour_log: np.ndarray  # (2, n) int32, the tour of each logged city
     length_log: np.ndarray  # (2, n) float64, the length of that tour before the change
-    key: np.ndarray  # (n,) float64, by which the removed cities are sorted
+    key: np.ndarray  # (n,) float64, sort keys of the removed cities
 
 
 @njit(cache=True, nogil=True)
 def nearest_cities(x: np.ndarray, y: np.ndarray, n: int, n_near: int) -> tuple[np.ndarray, np.ndarray]:
-    """``near`` and ``near_distance`` of a Search, for nodes at ``x`` and ``y`` (at least n,). O(n^2) time."""
+    """``near`` and ``near_distance`` of a Search for the first n nodes of ``x`` and ``y``. O(n^2) time."""
     near, distance = np.zeros((n, n_near), np.int64), np.zeros((n, n_near))
     for city in range(1, n if n_near else 0):
-        found = 0
+        n_listed = 0
         for other in range(1, n):
             square = (x[city] - x[other]) ** 2 + (y[city] - y[other]) ** 2
-            if other == city or (found == n_near and square >= distance[city, found - 1]):
+            if other == city or (n_listed == n_near and square >= distance[city, n_listed - 1]):
                 continue
-            found = min(found + 1, n_near)
-            i = found - 1
+            n_listed = min(n_listed + 1, n_near)
+            i = n_listed - 1
             while i > 0 and distance[city, i - 1] > square:
                 distance[city, i], near[city, i] = distance[city, i - 1], near[city, i - 1]
                 i -= 1
@@ -83,9 +84,9 @@ def nearest_cities(x: np.ndarray, y: np.ndarray, n: int, n_near: int) -> tuple[n
 
 @njit(cache=True, nogil=True)
 def insert_greedily(search: Search, order: np.ndarray) -> None:
-    """Put the cities of ``order`` on the tours in this order, each where its tour stays shortest. O(n^2).
+    """Put the cities of ``order`` on the tours in this order, each where its tour stays shortest. O(n^2) time.
 
-    Without heads the tours begin empty; with any, ``load_tours`` and ``sum_lengths`` have put these on theirs.
+    If there are heads, call ``load_tours`` and ``sum_lengths`` first; otherwise the tours must be empty.
     """
     depot = search.tour.shape[0] - search.length.shape[0]
     for city in order:
@@ -104,7 +105,7 @@ def insert_greedily(search: Search, order: np.ndarray) -> None:
 
 @njit(cache=True, nogil=True)
 def load_tours(search: Search, order: np.ndarray) -> None:
-    """Make the tours anew from ``order`` (n - 1 + m,): the cities of each tour, its head first, and then a 0."""
+    """Replace the tours by ``order`` (n - 1 + m,): for each tour its cities, the head first, and then a 0."""
     depot = search.tour.shape[0] - search.length.shape[0]
     search.n_movable[:] = 0
     for node in range(depot, search.tour.shape[0]):
@@ -123,7 +124,7 @@ def load_tours(search: Search, order: np.ndarray) -> None:
 
 @njit(cache=True, nogil=True)
 def best_order(search: Search) -> np.ndarray:
-    """The best tours so far, int64 (n - 1 + m,), as ``load_tours`` takes them."""
+    """The best tours so far in the form of ``load_tours``, int64 (n - 1 + m,)."""
     n_agents = search.length.shape[0]
     depot = search.tour.shape[0] - n_agents
     order = np.zeros(depot - 1 + n_agents, np.int64)
@@ -140,7 +141,7 @@ def best_order(search: Search) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def sum_lengths(search: Search) -> float:
-    """Sum the lengths of the tours afresh; the makespan."""
+    """Compute the tours' lengths and the legs from the coordinates; returns the makespan."""
     n_agents = search.length.shape[0]
     depot = search.tour.shape[0] - n_agents
     for agent in range(n_agents):
@@ -160,19 +161,19 @@ def sum_lengths(search: Search) -> float:
 
 @njit(cache=True, nogil=True)
 def anneal(
-    search: Search, iterations: int, hot: float, cold: float, best: float, enough: float, weight: float
+    search: Search, iterations: int, hot: float, cold: float, best: float, target: float, weight: float
 ) -> float:
-    """Simulated annealing of the current tours from temperature ``hot`` to ``cold``, geometric, in units of length.
+    """Anneal the current tours from temperature ``hot`` to ``cold`` (lengths), with geometric cooling.
 
-    ``search.best`` changes whenever the score, the makespan plus ``weight`` times the total length, falls below
-    ``best``; a score of at most ``enough`` ends the search. Returns the best score.
+    The score is the makespan plus ``weight`` times the total length. Tours with a score below ``best`` are copied to
+    ``search.best``; a score of at most ``target`` ends the search. Returns the best score.
     """
     makespan = sum_lengths(search)
     total = search.length.sum()
     search.ruined[:] = -1
     temperature, cooling = hot, (cold / hot) ** (1.0 / max(1, iterations))
     for iteration in range(iterations):
-        if best <= enough:
+        if best <= target:
             break
         if iteration % REFRESH == REFRESH - 1:
             makespan = sum_lengths(search)
@@ -185,7 +186,7 @@ def anneal(
             makespan = longest
             total += growth - shrinkage
             score = makespan + weight * total
-            if score < best - FINE:
+            if score < best - TOLERANCE:
                 best = score
                 search.best[:] = search.next
         else:
@@ -194,12 +195,12 @@ def anneal(
     return best
 
 
-# The parts of an iteration have one caller each and are compiled into it: calls with so many arrays cost a tenth
+# The steps of an iteration are compiled into their only caller: calls with so many arrays would take 10 % of the time
 
 
 @njit(cache=True, inline="always")
 def _ruin(search: Search, iteration: int, makespan: float) -> tuple[int, float]:
-    """Remove strings of cities around a random city; how many cities, and how much the total length shrinks."""
+    """Remove strings of cities around a random city; returns (n_removed, decrease of the total length)."""
     n_agents = search.length.shape[0]
     n_cities = search.tour.shape[0] - n_agents - 1
     max_string = min(MAX_STRING, max(1.0, n_cities / n_agents))
@@ -207,7 +208,7 @@ def _ruin(search: Search, iteration: int, makespan: float) -> tuple[int, float]:
     centre = 1 + int(_random(search) * n_cities)
     if _random(search) < LONGEST_CHANCE:
         for _ in range(2 * n_agents):
-            if search.length[search.tour[centre]] >= makespan - FINE:
+            if search.length[search.tour[centre]] >= makespan - TOLERANCE:
                 break
             centre = 1 + int(_random(search) * n_cities)
     n_removed, shrinkage = 0, 0.0
@@ -228,7 +229,7 @@ def _ruin(search: Search, iteration: int, makespan: float) -> tuple[int, float]:
 
 @njit(cache=True, inline="always")
 def _remove_string(search: Search, n_removed: int, city: int, agent: int, max_string: float) -> int:
-    """Remove a string of ``agent``'s tour around ``city``, or both ends of a longer one; n_removed from then on."""
+    """Remove a string of ``agent``'s tour around ``city``, or both ends of a longer string; returns ``n_removed``."""
     depot = search.tour.shape[0] - search.length.shape[0]
     count = search.n_movable[agent]
     n_remove = int(_random(search) * min(float(count), max_string) + 1.0)
@@ -238,7 +239,7 @@ def _remove_string(search: Search, n_removed: int, city: int, agent: int, max_st
         while n_remove + n_leave < count and _random(search) < LEAVE_CHANCE:
             n_leave += 1
     span = n_remove + n_leave
-    # The string begins up to span - 1 cities before this one, as far as the ends of the tour allow
+    # The string begins up to span - 1 cities before ``city``, as far as the ends of the tour allow
     node, behind, most_behind = city, 0, int(_random(search) * span)
     while behind < most_behind and search.previous[node] < depot and search.leg[search.previous[node]] > -inf:
         node = search.previous[node]
@@ -267,7 +268,7 @@ def _remove_string(search: Search, n_removed: int, city: int, agent: int, max_st
 
 @njit(cache=True, inline="always")
 def _sort(search: Search, n_removed: int) -> None:
-    """The order in which cities go back: random, farthest from the depot first, or nearest first (4 : 2 : 1)."""
+    """Choose the order in which cities go back: random, farthest from the depot first, or nearest first (4 : 2 : 1)."""
     depot = search.tour.shape[0] - 1
     rule = _random(search) * 7.0
     for i in range(n_removed):
@@ -286,8 +287,10 @@ def _sort(search: Search, n_removed: int) -> None:
 
 @njit(cache=True, inline="always")
 def _recreate(search: Search, n_removed: int, makespan: float, limit: float) -> tuple[int, float, float]:
-    """Put the removed cities back, each at its cheapest place, until the makespan plus the weighted growth of the total
-    length is at least ``limit``: it never falls again. How many are back, that growth, and that makespan."""
+    """Put the removed cities back, each at its cheapest place; returns (n_back, growth of the total length, makespan).
+
+    Stops early once the makespan plus the weighted growth has reached ``limit``, since this sum never falls.
+    """
     balance = _random(search) < BALANCE_CHANCE
     n_back, growth, longest = 0, 0.0, search.length.max()
     while n_back < n_removed and longest + TOTAL_WEIGHT * growth < limit:
@@ -306,18 +309,18 @@ def _recreate(search: Search, n_removed: int, makespan: float, limit: float) -> 
 
 @njit(cache=True, inline="always")
 def _cheapest_place(search: Search, city: int, makespan: float, balance: bool) -> tuple[int, float]:
-    """The node after which ``city`` goes, and by how much its tour grows."""
+    """The cheapest place for ``city``; returns (node before it, growth of the tour)."""
     depot = search.tour.shape[0] - search.length.shape[0]
     blink = int(_random(search) * BLINK)
-    found = (inf, depot, 0.0)
+    cheapest = (inf, depot, 0.0)
     for k in range(search.near.shape[1]):
         node = search.near[city, k]
         if search.tour[node] >= 0 and k != blink:
-            found = _cheaper(search, city, node, search.near_distance[city, k], makespan, balance, found)
+            cheapest = _cheaper(search, city, node, search.near_distance[city, k], makespan, balance, cheapest)
     home = _distance(search, depot, city)
-    for node in range(depot, search.tour.shape[0]):  # without blinks, so that there always is a place
-        found = _cheaper(search, city, node, home, makespan, balance, found)
-    _, place, growth = found
+    for node in range(depot, search.tour.shape[0]):  # never overlooked, so that there is always a place
+        cheapest = _cheaper(search, city, node, home, makespan, balance, cheapest)
+    _, place, growth = cheapest
     return place, growth
 
 
@@ -329,15 +332,15 @@ def _cheaper(
     to_node: float,
     makespan: float,
     balance: bool,
-    found: tuple[float, int, float],
+    cheapest: tuple[float, int, float],
 ) -> tuple[float, int, float]:
-    """``found`` (cost, place, growth of the tour), or the place before or after ``node`` where one is cheaper."""
-    least, place, place_growth = found
+    """The cheapest of ``cheapest`` (cost, node before, growth of the tour) and the places before and after ``node``."""
+    least, place, place_growth = cheapest
     length = search.length[search.tour[node]]
     offset = length if balance else 0.0
     for side in range(2):  # before the node, after it
         end = node if side == 0 else search.next[node]
-        # A cheap bound: the leg's other end is farther away than this node, or the leg has had its turn from there
+        # Quick bound: either the leg's other end is at least as far from the city, or the leg has been tried from there
         if 2.0 * to_node - search.leg[end] + offset >= least:
             continue
         other = search.previous[node] if side == 0 else end
@@ -352,6 +355,7 @@ def _cheaper(
 
 @njit(cache=True, inline="always")
 def _undo(search: Search, n_removed: int, n_back: int) -> None:
+    """Undo an iteration, last change first."""
     for i in range(n_back - 1, -1, -1):
         _unlink(search, search.city_log[1, i])
         search.length[search.tour_log[1, i]] = search.length_log[1, i]
@@ -362,7 +366,7 @@ def _undo(search: Search, n_removed: int, n_back: int) -> None:
 
 @njit(cache=True, inline="always")
 def _link(search: Search, city: int, place: int) -> None:
-    """Put ``city`` after the node ``place``; the tour's length is the caller's to change."""
+    """Put ``city`` after the node ``place``; the caller updates the tour's length."""
     following = search.next[place]
     search.next[place], search.previous[city] = city, place
     search.next[city], search.previous[following] = following, city
@@ -374,7 +378,7 @@ def _link(search: Search, city: int, place: int) -> None:
 
 @njit(cache=True, inline="always")
 def _unlink(search: Search, city: int) -> None:
-    """Take ``city`` off its tour; the tour's length is the caller's to change."""
+    """Take ``city`` off its tour; the caller updates the tour's length."""
     before, following = search.previous[city], search.next[city]
     search.next[before], search.previous[following] = following, before
     search.leg[following] = _distance(search, before, following)
@@ -390,7 +394,7 @@ def _distance(search: Search, a: int, b: int) -> float:
 
 @njit(cache=True, inline="always")
 def _random(search: Search) -> float:
-    """Uniform in [0, 1): xorshift64*."""
+    """A random number, uniform in [0, 1) (xorshift64*)."""
     z = search.random[0]
     z ^= z >> np.uint64(12)
     z ^= z << np.uint64(25)

@@ -1,17 +1,17 @@
-"""Samples are drawn as surely as they are told to be, and agents see as far; the tables of both."""
+"""C decides how far samples differ, the view what agents see; the tables of both sweeps."""
 
 import numpy as np
 import pytest
 
-from benchmarks import scan
 from benchmarks.__main__ import main
+from benchmarks.studies import sweeps
 from benchmarks.suite import Cell
 from dan_policy import solve
 from dan_policy.heuristics import sampling_clip
 from mtsp_env import uniform
 
 
-def test_without_a_clip_samples_take_the_one_of_their_size() -> None:
+def test_the_default_clip_is_that_of_the_size() -> None:
     instance = uniform(np.random.default_rng(0), 30, 3)
     plain = solve(instance, decode="sample", samples=4)
     assert solve(instance, decode="sample", samples=4, clip=sampling_clip(10.0, 30)).tours == plain.tours
@@ -19,8 +19,8 @@ def test_without_a_clip_samples_take_the_one_of_their_size() -> None:
         solve(instance, decode="sample", clip=0.0)
 
 
-def test_the_surer_the_samples_the_more_alike() -> None:
-    """With a C of 10,000 every sample is the greedy game; with one of 0.001 none is any good."""
+def test_samples_differ_less_with_a_larger_clip() -> None:
+    """With C = 10,000 every sample is the greedy game; with C = 0.001 samples are nearly random."""
     instance = uniform(np.random.default_rng(0), 30, 3)
     greedy = solve(instance)
     assert solve(instance, decode="sample", samples=2, clip=1e4).makespan == pytest.approx(greedy.makespan)
@@ -29,20 +29,20 @@ def test_the_surer_the_samples_the_more_alike() -> None:
 
 def test_the_table_compares_with_the_c_in_use(tmp_path, capsys) -> None:
     out = tmp_path / "clip.md"
-    assert main(["clip", "--sizes", "8x2", "60x4", "--instances", "2", "--samples", "3", "--out", str(out)]) == 0
+    assert main(["sweep-clip", "--sizes", "8x2", "60x4", "--instances", "2", "--samples", "3", "--out", str(out)]) == 0
     rows = [line.split(" | ") for line in out.read_text().splitlines() if line.startswith(("| 8", "| 60"))]
     assert [(row[0], row[1]) for row in rows] == [
         ("| 8, 2", "10"), ("| 8, 2", "5"), ("| 8, 2", "20"), ("| 60, 4", "12"), ("| 60, 4", "6"), ("| 60, 4", "24")
     ]  # fmt: skip
     assert [row[3] == "–" for row in rows] == [True, False, False] * 2
-    assert main(["clip", "--instances", "1"]) == 2 and "at least 2, got 1" in capsys.readouterr().err
-    assert main(["clip", "--sizes", "50"]) == 2 and "such as 50x5, got '50'" in capsys.readouterr().err
+    assert main(["sweep-clip", "--instances", "1"]) == 2 and "at least 2, got 1" in capsys.readouterr().err
+    assert main(["sweep-clip", "--sizes", "50"]) == 2 and "such as 50x5, got '50'" in capsys.readouterr().err
 
 
 def test_the_table_compares_with_seeing_everything(tmp_path) -> None:
-    """With more cities to see than there are, nothing but that; with fewer, other plans."""
+    """Views that are not smaller than the instance are left out; smaller ones give other tours."""
     out = tmp_path / "view.md"
-    assert main(["view", "--sizes", "40x3", "120x4", "--instances", "2", "--out", str(out)]) == 0
+    assert main(["sweep-view", "--sizes", "40x3", "120x4", "--instances", "2", "--out", str(out)]) == 0
     lines = out.read_text().splitlines()
     rows = [line.strip("| ").split(" | ") for line in lines if line.startswith(("| 40", "| 12"))]
     assert [(row[0], row[1]) for row in rows] == [
@@ -52,5 +52,5 @@ def test_the_table_compares_with_seeing_everything(tmp_path) -> None:
         ("120, 4", "50"),
     ]
     assert [row[3] == "–" for row in rows] == [True, True, False, False]
-    plans = [solve(one, view=50) for one in Cell(120, 4, 2).instances(scan.SEED)]
+    plans = [solve(one, view=50) for one in Cell(120, 4, 2).instances(sweeps.SEED)]
     assert float(rows[3][2]) == pytest.approx(np.mean([plan.makespan for plan in plans]), abs=1e-4)

@@ -1,6 +1,7 @@
-"""A process that solves one instance after the other for ``crew``: one core, one thread and a process group of its own.
+"""A process that solves one instance after the other for the supervisor, with one thread on one core.
 
-It loads and warms up each solver once, so that a row's seconds hold neither imports, nor compiling, nor weights.
+It leads a process group. Each solver is loaded and warmed up once, so that measured times include neither imports nor
+compilation nor the loading of weights.
 """
 
 from __future__ import annotations
@@ -23,35 +24,35 @@ from mtsp_env.tours import check_tours, makespan
 
 READY = "ready"  # sent before the clock starts
 WARM_UP = Instance([[0.5, 0.5], [0.1, 0.2], [0.9, 0.1], [0.8, 0.9], [0.2, 0.7], [0.4, 0.1]], n_agents=2, name="warm-up")
-WARM_UP_SECONDS = 0.2  # where a solver goes on for as long as it may
+WARM_UP_SECONDS = 0.2  # for solvers that use all of their budget
 
 
-def solve(connection: Connection, method: str, instance: Instance, seconds: float, seed: int, known: dict) -> None:
-    """Send READY, then the outcome; ``known`` holds the solvers that are loaded and warm."""
-    if method not in known:
+def solve(connection: Connection, method: str, instance: Instance, seconds: float, seed: int, loaded: dict) -> None:
+    """Send READY, then the outcome. ``loaded`` maps names to the solvers that are loaded and warm."""
+    if method not in loaded:
         try:
-            known[method] = solvers.find(method)
+            loaded[method] = solvers.find(method)
         except Exception as error:
             connection.send(READY)
-            connection.send(_failed(error) | {"seconds": 0.0})
+            connection.send(_failure(error) | {"seconds": 0.0})
             return
-        with suppress(Exception, SystemExit):  # whatever goes wrong will go wrong again below, where it is told
-            known[method](WARM_UP, min(seconds, WARM_UP_SECONDS), 0)
+        with suppress(Exception, SystemExit):  # an error here will occur again below, where it is reported
+            loaded[method](WARM_UP, min(seconds, WARM_UP_SECONDS), 0)
     gc.collect()
     connection.send(READY)
-    connection.send(attempt(known[method], instance, seconds, seed))
+    connection.send(attempt(loaded[method], instance, seconds, seed))
 
 
-def attempt(function: solvers.Solve, instance: Instance, seconds: float, seed: int) -> dict[str, Any]:
-    """The fields of a ``Row`` that say what a solver did, whatever it does."""
+def attempt(solver: solvers.Solve, instance: Instance, seconds: float, seed: int) -> dict[str, Any]:
+    """Run a solver, whatever it does; returns the fields of a ``Row`` that describe the outcome."""
     cpu, start = _cpu_seconds(), time.perf_counter()
+    failure = None
     try:
-        answer = function(instance, seconds, seed)
-        outcome = None
+        answer = solver(instance, seconds, seed)
     except (Exception, SystemExit) as error:
-        outcome = _failed(error)
+        failure = _failure(error)
     times = {"seconds": time.perf_counter() - start, "cpu_seconds": _cpu_seconds() - cpu}
-    return (outcome or judge(instance, answer)) | times
+    return (failure or judge(instance, answer)) | times
 
 
 def judge(instance: Instance, answer: Tours | solvers.Answer) -> dict[str, Any]:
@@ -61,12 +62,12 @@ def judge(instance: Instance, answer: Tours | solvers.Answer) -> dict[str, Any]:
         check_tours(instance, tours)
         tours = [[int(node) for node in tour] for tour in tours]
         bound = None if bound is None else float(bound)
-    except Exception as error:  # an answer may be anything
+    except Exception as error:  # an answer can be any object
         return {"status": "wrong tours", "error": f"{type(error).__name__}: {error}"[:1000]}
     return {"status": "ok", "tours": tours, "makespan": makespan(instance, tours), "bound": bound}
 
 
-def _failed(error: BaseException) -> dict[str, Any]:
+def _failure(error: BaseException) -> dict[str, Any]:
     if isinstance(error, solvers.Unavailable):
         return {"status": "unavailable", "error": str(error)[:1000]}
     if isinstance(error, ModuleNotFoundError):
@@ -77,13 +78,13 @@ def _failed(error: BaseException) -> dict[str, Any]:
 
 
 def _cpu_seconds() -> float:
-    """Of this process and of its children that have ended."""
+    """CPU time of this process and of its children that have ended."""
     children = resource.getrusage(resource.RUSAGE_CHILDREN)
     return time.process_time() + children.ru_utime + children.ru_stime
 
 
 def _receive(connection: Connection, jobs: SimpleQueue) -> None:
-    """Queue what comes in; when whoever sends it is gone, so are we, whatever a solver is doing."""
+    """Queue the jobs that arrive. When the supervisor is gone, kill this process group, even if a solver is running."""
     with suppress(EOFError, OSError):
         while True:
             jobs.put(connection.recv())
@@ -91,13 +92,13 @@ def _receive(connection: Connection, jobs: SimpleQueue) -> None:
 
 
 def main(descriptor: int, core: int | None) -> None:
-    """Solve what comes in on the connection with that file descriptor, on that core; never returns."""
+    """Solve the jobs that arrive on the connection with this file descriptor, on this core; never returns."""
     if core is not None:
         os.sched_setaffinity(0, {core})
-    connection, jobs, known = Connection(descriptor), SimpleQueue(), {}
+    connection, jobs, loaded = Connection(descriptor), SimpleQueue(), {}
     Thread(target=_receive, args=(connection, jobs), daemon=True).start()
     while True:
-        solve(connection, *jobs.get(), known)
+        solve(connection, *jobs.get(), loaded)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""How fast training is: episodes, demonstrations and decisions per second, and the share of the machine's FLOP rate.
+"""Speed of training: episodes, demonstrations and decisions per second, and the share of the machine's FLOP rate.
 
-Useful FLOP are those of the network's matrix products, counted once forwards and once backwards; the denominator is the
-rate of a large float32 product on the same device, measured in the same run. With bfloat16 a share may pass 100 %.
+Useful FLOP are those of the network's matrix products, forwards and backwards once each. They are divided by the rate
+of a large float32 product on the same device, measured in the same run; with bfloat16 a share can exceed 100 %.
 """
 
 from __future__ import annotations
@@ -10,29 +10,31 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 from torch.utils.flop_counter import FlopCounterMode
 
-from benchmarks.speed import machine, matmul_rate, per_second, wait_for
-from dan_policy.episode import find_device
+from benchmarks.studies.timing import machine_title, matmul_rate, per_second, wait_for
 from train.collect import draw, play, repeat
 from train.config import ImitateConfig
 from train.demonstrations import demonstrate
-from train.imitate import Imitator
+from train.imitate import ImitationLearner
 from train.presets import REFINE
-from train.reinforce import Trainer
+from train.reinforce import ReinforceLearner
 
 SIZES = ((20, 3), (50, 5), (100, 10), (200, 20))
-TOKENS = 3200  # instances times nodes at a time, on a CPU
+TOKENS = 3200  # instances times nodes in a batch
 Precision = Literal["float32", "bfloat16"]
 
 
-def speed(device: str = "cpu", seconds: float = 3.0, precision: Precision = "float32", tokens: int = TOKENS) -> Table:
-    """Measure every size; ``seconds`` each."""
+def speed_table(
+    device: str = "cpu", seconds: float = 3.0, precision: Precision = "float32", tokens: int = TOKENS
+) -> Table:
+    """Measure every size for ``seconds`` each, with batches of ``tokens`` nodes."""
     rate = matmul_rate(device)
     table = Table("what", "size", "instances/s", "decisions/s", "of the matrix-product rate")
-    table.title = f"{machine(device)}; official DAN, pruned, {precision}; float32 product {rate / 1e9:.0f} GFLOP/s"
+    table.title = (
+        f"{machine_title(device)}; official DAN, pruned, {precision}; float32 product {rate / 1e9:.0f} GFLOP/s"
+    )
     for n_nodes, n_agents in SIZES:
         batch = max(8, tokens // n_nodes)
         for name, measure in (("rollout", rollouts), ("imitation", imitation), ("REINFORCE, 8 samples", reinforcement)):
@@ -41,22 +43,22 @@ def speed(device: str = "cpu", seconds: float = 3.0, precision: Precision = "flo
             instances, decisions, flops = measure(setting, batch, seconds)
             share = f"{100 * flops / rate:.0f} %"
             table.add_row(name, f"n={n_nodes}, m={n_agents}, B={batch}", f"{instances:.1f}", f"{decisions:.0f}", share)
-        made = teaching(n_nodes, n_agents, seconds)
-        table.add_row("teacher, one core", f"n={n_nodes}, m={n_agents}", f"{made:.1f}", "", "")
+        rate_of_teacher = teaching(n_nodes, n_agents, seconds)
+        table.add_row("teacher, one core", f"n={n_nodes}, m={n_agents}", f"{rate_of_teacher:.1f}", "", "")
     return table
 
 
 def rollouts(setting: dict, batch: int, seconds: float) -> tuple[float, float, float]:
     """Sampled episodes: instances, decisions and useful FLOP per second."""
     config = replace(REFINE, **setting)
-    trainer = Trainer(config)
-    instances = draw(np.random.default_rng(0), config, batch)
+    learner = ReinforceLearner(config)
+    problem = draw(np.random.default_rng(0), config, batch)
     with FlopCounterMode(display=False) as counter:
-        episode = play(trainer.network, instances, config, "sample")
+        episode = play(learner.network, problem, config, "sample")
     decisions, flops = int(episode.valid.sum()), counter.get_total_flops()
 
     def once() -> int:
-        play(trainer.network, instances, config, "sample")
+        play(learner.network, problem, config, "sample")
         return 1
 
     times = per_second(once, seconds, wait_for(config.device))
@@ -64,46 +66,46 @@ def rollouts(setting: dict, batch: int, seconds: float) -> tuple[float, float, f
 
 
 def imitation(setting: dict, batch: int, seconds: float) -> tuple[float, float, float]:
-    """Optimiser steps on demonstrations that are there; the teacher has a row of its own."""
+    """Optimiser steps on existing demonstrations: instances, decisions and useful FLOP per second."""
     tokens = batch * setting["n_nodes"][0]
     config = replace(ImitateConfig(), **setting, workers=0, teacher_iterations=1, set_tokens=tokens, buffer=4)
-    learner = Imitator(config)
+    learner = ImitationLearner(config)
     learner.buffer.draw(1)
     sets = list(learner.buffer.sets)
 
     def step() -> int:
-        rows = [decisions[len(valid) // 2][valid[len(valid) // 2]] for decisions, valid in sets]  # half the cities left
-        learner.buffer.draw = lambda _: rows
+        halfway = [decisions[len(valid) // 2][valid[len(valid) // 2]] for decisions, valid in sets]  # half visited
+        learner.buffer.draw = lambda _: halfway
         learner.train_step()
-        return sum(map(len, rows))
+        return sum(map(len, halfway))
 
     step()
     with FlopCounterMode(display=False) as counter:
         decisions = step()
     rate = per_second(step, seconds, wait_for(config.device))
-    made = setting["n_nodes"][0] - 1 + setting["n_agents"][0]
-    return rate / made, rate, rate / decisions * counter.get_total_flops()
+    decisions_per_instance = setting["n_nodes"][0] - 1 + setting["n_agents"][0]
+    return rate / decisions_per_instance, rate, rate / decisions * counter.get_total_flops()
 
 
 def reinforcement(setting: dict, batch: int, seconds: float) -> tuple[float, float, float]:
-    """Whole steps of the preset "refine": play, gradient, update."""
+    """Whole training steps of the preset "refine": instances, decisions and useful FLOP per second."""
     config = replace(REFINE, **setting, batch_size=max(1, batch // REFINE.samples), batch_tokens=None)
-    trainer = Trainer(config)
-    instances = repeat(draw(np.random.default_rng(0), config, config.batch_size), config.samples)
-    decisions = int(play(trainer.network, instances, config, "sample").valid.sum())
+    learner = ReinforceLearner(config)
+    problem = repeat(draw(np.random.default_rng(0), config, config.batch_size), config.samples)
+    decisions = int(play(learner.network, problem, config, "sample").valid.sum())
 
     def step() -> int:
-        trainer.train_step()
+        learner.train_step()
         return 1
 
     with FlopCounterMode(display=False) as counter:
         step()
     times = per_second(step, seconds, wait_for(config.device))
-    return times * len(instances.nodes), times * decisions, times * counter.get_total_flops()
+    return times * len(problem.nodes), times * decisions, times * counter.get_total_flops()
 
 
 def teaching(n_nodes: int, n_agents: int, seconds: float) -> float:
-    """Labelled instances per second of one core."""
+    """Instances that the reference solver labels per second, on one core."""
     size = {"n_nodes": (n_nodes, n_nodes), "n_agents": (n_agents, n_agents), "nodes_per_agent": 1}
     config = ImitateConfig(**size, set_tokens=16 * n_nodes)
     index = iter(range(10**9))
@@ -112,9 +114,3 @@ def teaching(n_nodes: int, n_agents: int, seconds: float) -> float:
         return len(demonstrate(config, next(index)).nodes)
 
     return per_second(once, seconds)
-
-
-def main(device: str = "cpu", seconds: float = 3.0, precision: Precision = "float32") -> None:
-    """Print the table. Raises ValueError where there is no such device."""
-    find_device(device)
-    Console(width=max(Console().width, 120)).print(speed(device, seconds, precision))

@@ -12,10 +12,10 @@ from functools import cache, partial
 import numpy as np
 import pytest
 import torch
-from oracle import Oracle
 from tensordict import TensorDict
 from torchrl.envs.utils import step_mdp
 
+from helpers.oracle import Oracle
 from mtsp_env import Instance, mtsp_v0, rules
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.instance import Problem

@@ -1,20 +1,20 @@
-"""Pictures of results: gap against time, and planning time against the size of the problem."""
+"""Plots of results: gap against time, and planning time against the size of the instances."""
 
 from __future__ import annotations
 
 import math
-import os
 from pathlib import Path
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullLocator
 
+from benchmarks.reports.statistics import Results, mean
 from benchmarks.solvers import SOLVERS
-from benchmarks.stats import Results, mean
 from benchmarks.suite import AnyCell, Cell
+from mtsp_env.files import atomic_write
 
-# A colour and a marker for each method, the same in every picture: DAN warm, the reference black, its rivals cold
+# A colour and a marker for each method: warm colours for DAN, black for the reference, cold ones for the others
 STYLE = {
     "random": ("0.75", "x"),
     "nearest": ("0.5", "X"),
@@ -37,24 +37,24 @@ STYLE = {
     "ea": ("#01665e", "v"),
     "som": ("#35978f", "<"),
 }
-OTHER = [("#b15928", "h"), ("#e377c2", "p"), ("#bcbd22", "d"), ("#17becf", ">")]  # solvers of one's own
+OTHER = [("#b15928", "h"), ("#e377c2", "p"), ("#bcbd22", "d"), ("#17becf", ">")]  # for solvers that are not in SOLVERS
 
 
 def gaps(results: Results, path: Path) -> None:
-    """Mean gap to the best known tours against mean seconds: a panel per cell, a point per method and budget.
+    """Plot the mean gap to the best known tours against mean seconds: a panel per cell, a point per method and budget.
 
-    Budgets of one method are joined. Cells with a single instance share one panel.
+    A line joins the budgets of one method. Cells with a single instance share one panel.
     """
     cells = results.cells
-    single = all(len(results.instances(cell.label)) == 1 for cell in cells) and len(cells) > 1
-    panels = [cells] if single else [[cell] for cell in cells]
+    shared = all(len(results.instances(cell.label)) == 1 for cell in cells) and len(cells) > 1
+    panels = [cells] if shared else [[cell] for cell in cells]
     columns = min(3, len(panels))
     rows = math.ceil(len(panels) / columns)
     width = 1.6 + 3.3 * columns if columns > 1 else 7.2
     figure = Figure(figsize=(width, 1.0 + 2.7 * rows if columns > 1 else 4.6), layout="constrained")
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for ax, panel in zip(axes.flat, panels, strict=False):
-        title = f"{len(cells)} instances" if single else _title(results, panel[0])
+        title = f"{len(cells)} instances" if shared else _title(results, panel[0])
         _gap_panel(ax, results, [cell.label for cell in panel], title)
     for ax in axes.flat[len(panels) :]:
         ax.set_axis_off()
@@ -75,7 +75,7 @@ def _gap_panel(ax: Axes, results: Results, cells: list[str], title: str) -> None
         for label in labels:
             gap = mean([100 * value for cell in cells for value in results.gaps(label, cell).values()])
             if gap is not None:
-                seconds = mean([row.seconds for cell in cells for row in results.right(label, cell).values()])
+                seconds = mean([row.seconds for cell in cells for row in results.solved(label, cell).values()])
                 points.append((seconds.mean, max(gap.mean, 0.0), gap.error or 0.0))
         if points:
             colour, marker = _style(method, results)
@@ -92,27 +92,27 @@ def _gap_panel(ax: Axes, results: Results, cells: list[str], title: str) -> None
 
 
 def planning_time(results: Results, path: Path) -> None:
-    """Mean seconds against n, for the methods that end by themselves; the paper's Figure 4, on logarithmic axes.
+    """Plot mean seconds against n for the methods without a budget: the paper's Figure 4, on logarithmic axes.
 
-    A cross is a size at which a method was killed at its limit.
+    A cross marks a size at which a method was killed at its limit.
     """
     figure = Figure(figsize=(7.2, 4.6), layout="constrained")
     ax = figure.subplots()
     for method, labels in results.methods().items():
         if labels != [method]:
-            continue  # it takes a budget, and all of it
+            continue  # it takes a budget and uses all of it
         colour, marker = _style(method, results)
-        done, killed = [], []
+        finished, killed = [], []
         for cell in results.cells:
             rows = results.rows[method].get(cell.label, {}).values()
             seconds = mean([row.seconds for row in rows if row.ok])
             if seconds is not None:
-                done.append((cell.n_nodes, seconds.mean, seconds.error or 0.0))
+                finished.append((cell.n_nodes, seconds.mean, seconds.error or 0.0))
             late = mean([row.seconds for row in rows if row.status == "timeout"])
             if late is not None and seconds is None:
                 killed.append((cell.n_nodes, late.mean))
-        if done:
-            x, y, error = zip(*done, strict=True)
+        if finished:
+            x, y, error = zip(*finished, strict=True)
             ax.errorbar(x, y, error, color=colour, marker=marker, ms=5, lw=1.2, label=method)
         if killed:
             ax.plot(*zip(*killed, strict=True), color=colour, marker="x", ms=8, lw=0, label=f"{method}: killed")
@@ -130,8 +130,8 @@ def planning_time(results: Results, path: Path) -> None:
 def _style(method: str, results: Results) -> tuple[str, str]:
     if method in STYLE:
         return STYLE[method]
-    own = [name for name in results.methods() if name not in SOLVERS]
-    return OTHER[own.index(method) % len(OTHER)]
+    others = [name for name in results.methods() if name not in SOLVERS]
+    return OTHER[others.index(method) % len(OTHER)]
 
 
 def _tidy(ax: Axes) -> None:
@@ -143,7 +143,7 @@ def _tidy(ax: Axes) -> None:
 
 
 def _legend(figure: Figure, axes) -> None:
-    """One for all panels."""
+    """Draw one legend for all panels."""
     handles = {}
     for ax in axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
@@ -152,7 +152,6 @@ def _legend(figure: Figure, axes) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """The whole picture, or none of it."""
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
-    figure.savefig(temporary, dpi=130)
-    os.replace(temporary, path)
+    """Write a figure atomically, in the format that the path's suffix names."""
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, format=path.suffix[1:], dpi=130)

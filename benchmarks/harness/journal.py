@@ -1,0 +1,52 @@
+"""A growing file of rows, so that an interrupted run can be resumed."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from dataclasses import asdict
+from pathlib import Path
+
+from benchmarks.harness.rows import Row, parse_lines
+
+
+class Journal:
+    """A file of rows, open for appending; ``rows`` holds those that it had when it was opened.
+
+    A last line that was cut off when its writer was killed is dropped. A lock on the file allows one writer at a time.
+
+    Raises:
+        OSError: the file cannot be written.
+        ValueError: a damaged line before the last, a gzipped file, or another writer.
+    """
+
+    def __init__(self, path: Path) -> None:
+        if path.suffix == ".gz":
+            raise ValueError(f"{path}: rows are appended to plain files only; gzip it when it is complete")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = open(path, "a+b")  # noqa: SIM115 (closed by __exit__)
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._file.seek(0)
+            whole_lines = self._file.read().rpartition(b"\n")[0]
+            self._file.truncate(len(whole_lines) + 1 if whole_lines else 0)
+            self.rows = list(parse_lines(path, whole_lines))
+        except BlockingIOError:
+            self._file.close()
+            raise ValueError(f"{path}: another run is writing to it") from None
+        except BaseException:
+            self._file.close()
+            raise
+
+    def append(self, row: Row) -> None:
+        """Append a row; it is on the disk when this returns."""
+        self._file.write(json.dumps(asdict(row), separators=(",", ":")).encode() + b"\n")
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
+    def __enter__(self) -> Journal:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()

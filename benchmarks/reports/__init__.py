@@ -1,0 +1,1 @@
+"""Tables in Markdown, statistics and plots from rows of results."""

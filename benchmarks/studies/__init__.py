@@ -1,0 +1,1 @@
+"""Measurements beyond the paper's tables, one command each."""

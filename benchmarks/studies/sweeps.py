@@ -1,0 +1,140 @@
+"""Sweeps over what ``solve`` chooses by itself: C, the range of the logits of samples, and the cities in view."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+from rich.progress import track
+from scipy.stats import sem
+
+from benchmarks.files import write_text
+from benchmarks.harness.machine import describe_machine
+from benchmarks.reports.markdown import markdown_table
+from benchmarks.suite import Cell
+from dan_policy import Solution, solve
+from dan_policy.heuristics import sampling_clip
+from mtsp_env.checks import check_count
+from mtsp_env.instance import Instance
+
+RESULTS = Path(__file__).parents[1] / "results"
+SEED = 123  # not that of a test set or of training
+C_FACTORS = (1.0, 0.5, 2.0)  # in units of the C that ``solve`` uses
+VIEWS = (200, 100, 50)  # cities
+
+
+def sweep_clip(
+    sizes: tuple[str, ...] = ("50x5", "50x10", "100x5", "100x10", "200x10"),
+    instances: int = 6,
+    samples: int = 64,
+    policy: str = "default",
+    augment: bool = False,
+    out: Path = RESULTS / "clip.md",
+) -> None:
+    """Compare makespans of samples drawn with the C that ``solve`` uses, half of it and twice of it; write a table.
+
+    Args:
+        sizes: sizes of the instances, such as 50x5.
+        instances: number of instances of each size, at least 2.
+        samples: number of samples of each solve.
+        policy: a shipped model or a file of weights.
+        augment: solve each instance in its eight symmetries.
+        out: file for the table.
+
+    Raises:
+        ValueError: fewer than 2 instances, or a bad size.
+    """
+
+    def solve_with(c: float, instance: Instance, seed: int) -> Solution:
+        return solve(instance, policy, decode="sample", samples=samples, seed=seed, augment=augment, clip=c)
+
+    cells = _cells(sizes, instances)
+    title = f"# Samples over C: best of {samples}{' in eight symmetries' if augment else ''}"
+    note = (
+        f'C is `dan_policy.heuristics.sampling_clip`; the first line of a size has its value. Weights "{policy}". '
+        f"Made by `python -m benchmarks sweep-clip --sizes {' '.join(sizes)} --instances {instances} "
+        f"--samples {samples}{' --augment' if augment else ''}`."
+    )
+    values = [[factor * sampling_clip(10.0, cell.n_nodes, augment) for factor in C_FACTORS] for cell in cells]
+    _sweep(out, title, note, "C", cells, values, solve_with)
+
+
+def sweep_view(
+    sizes: tuple[str, ...] = ("200x10", "300x10", "500x10", "1000x10"),
+    instances: int = 8,
+    samples: int | None = None,
+    policy: str = "default",
+    out: Path = RESULTS / "view.md",
+) -> None:
+    """Compare tours of agents that see all cities with those of agents that see only the nearest ones; write a table.
+
+    Args:
+        sizes: sizes of the instances, such as 500x10.
+        instances: number of instances of each size, at least 2.
+        samples: number of samples of each solve; by default decoding is greedy.
+        policy: a shipped model or a file of weights.
+        out: file for the table.
+
+    Raises:
+        ValueError: fewer than 2 instances, or a bad size.
+    """
+
+    def solve_with(view: float, instance: Instance, seed: int) -> Solution:
+        decode = {"decode": "greedy"} if samples is None else {"decode": "sample", "samples": samples}
+        return solve(instance, policy, seed=seed, view=int(view), **decode)
+
+    cells = _cells(sizes, instances)
+    title = f"# Cities in view: {'greedy' if samples is None else f'best of {samples} samples'}"
+    note = (
+        f'In the first line of a size agents see all cities. Weights "{policy}", {describe_machine()["processor"]}. '
+        f"Made by `python -m benchmarks sweep-view --sizes {' '.join(sizes)} --instances {instances}"
+        f"{'' if samples is None else f' --samples {samples}'}`."
+    )
+    values = [[cell.n_nodes, *(view for view in VIEWS if view < cell.n_nodes)] for cell in cells]
+    _sweep(out, title, note, "cities in view", cells, values, solve_with)
+
+
+def _cells(sizes: Iterable[str], instances: int) -> list[Cell]:
+    check_count("instances", instances, minimum=2)
+    return [_cell(size, instances) for size in sizes]
+
+
+def _cell(size: str, instances: int) -> Cell:
+    try:
+        n_nodes, n_agents = map(int, size.split("x"))
+    except ValueError:
+        raise ValueError(f"sizes must be such as 50x5, got {size!r}") from None
+    return Cell(n_nodes, n_agents, instances)
+
+
+def _sweep(
+    out: Path,
+    title: str,
+    note: str,
+    parameter: str,
+    cells: list[Cell],
+    values: list[list[float]],
+    solve_with: Callable[[float, Instance, int], Solution],
+) -> None:
+    """Solve the instances of each cell with each of its values; differences are to the cell's first value."""
+    lines = []
+    for cell, cell_values in zip(cells, values, strict=True):
+        first = None
+        for value in cell_values:
+            instances = track(cell.instances(SEED), f"{cell.label}, {parameter} {value:g}", transient=True)
+            solutions = [solve_with(value, instance, i) for i, instance in enumerate(instances)]
+            cost = np.array([solution.makespan for solution in solutions])
+            seconds = np.median([solution.seconds for solution in solutions])
+            first = cost if first is None else first
+            change = 100 * (cost / first - 1)
+            difference = "–" if first is cost else f"{change.mean():+.2f} ± {sem(change):.2f}"
+            lines.append([cell.heading, f"{value:g}", f"{cost.mean():.4f}", difference, f"{seconds:.2f}"])
+    table = markdown_table(["n, m", parameter, "makespan", "difference, %", "seconds"], lines)
+    text = (
+        f"{title}\n\nMean makespan over {cells[0].count} uniform instances of seed {SEED}, which is neither that of a "
+        f"test set nor of training, and paired difference to the first line of the size in %, ± standard error. "
+        f"{note}\n\n{table}\n"
+    )
+    write_text(out, text)
+    print(text)

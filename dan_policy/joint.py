@@ -1,0 +1,159 @@
+"""JointDAN: one transformer over agents, depot and unvisited cities, beyond the paper.
+
+In DAN, agents never see the cities before they are attended to, and no city attends to another after it has seen the
+agents. Here all tokens attend to each other in every layer, so that agents and cities can negotiate, at the same cost.
+The policy stays decentralised: one agent's observation in, logits of that agent's next node out.
+
+This module knows no environment: it takes tensors and returns tensors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from dan_policy.layers import AttentionLayer, open_nodes
+
+
+@dataclass(frozen=True)
+class JointConfig:
+    """The architecture of a JointDAN.
+
+    Raises:
+        ValueError: a size below 1, a number of heads that does not divide the width, a clip that is not above 0, or a
+            view below 1.
+    """
+
+    embed_dim: int = 128  # d
+    feedforward_dim: int = 512
+    n_heads: int = 4
+    n_layers: int = 5
+    tanh_clip: float = 10.0  # C: logits lie in [-C, C]
+    view: int | None = None  # see at most this many cities, the nearest unvisited ones; None: all of them
+
+    def __post_init__(self) -> None:
+        for name in ("embed_dim", "feedforward_dim", "n_heads", "n_layers"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
+        if self.embed_dim % self.n_heads:
+            raise ValueError(f"n_heads must divide embed_dim={self.embed_dim}, got {self.n_heads}")
+        if not self.tanh_clip > 0:
+            raise ValueError(f"tanh_clip must be above 0, got {self.tanh_clip!r}")
+        if self.view is not None and not (isinstance(self.view, int) and self.view >= 1):
+            raise ValueError(f"view must be None or at least 1 city, got {self.view!r}")
+
+
+class DenseLogits(NamedTuple):
+    """The policy, and what the network expects of all agents, for dense supervision; None: it has no such output.
+
+    Leading dimensions are those of the observation.
+    """
+
+    policy: Tensor  # (..., n) logits over the nodes: where the deciding agent goes next
+    next: Tensor | None  # (..., m, n) logits over the nodes: where each agent goes next
+    assignment: Tensor | None  # (..., m, n) logits over the agents: who visits a city
+
+
+class JointDAN(nn.Module):
+    """One pre-norm transformer over all tokens, then a single-head pointer from each agent to the nodes."""
+
+    in_keys = ("cities", "agents", "visited", "agent")
+    supports_bfloat16 = True  # trained and tested under autocast: logits stay float32
+
+    def __init__(self, config: JointConfig | None = None):
+        super().__init__()
+        self.config = config = config or JointConfig()
+        d = config.embed_dim
+        self.embed_depot = nn.Linear(2, d)
+        self.embed_city = nn.Linear(2, d)
+        self.embed_agent = nn.Linear(3, d)
+        self.decider = nn.Parameter(torch.randn(d) / 2)  # added to the deciding agent's token
+        self.layers = nn.ModuleList(
+            AttentionLayer(d, config.feedforward_dim, config.n_heads, "pre") for _ in range(config.n_layers)
+        )
+        self.norm = nn.LayerNorm(d)
+        self.next_query = nn.Linear(d, d, bias=False)
+        self.next_key = nn.Linear(d, d, bias=False)
+        self.assignment_query = nn.Linear(d, d, bias=False)
+        self.assignment_key = nn.Linear(d, d, bias=False)
+
+    def forward(self, cities: Tensor, agents: Tensor, visited: Tensor, agent: Tensor) -> Tensor:
+        """Logits over the nodes for one observation per row. Any number of leading dimensions is fine.
+
+        Args:
+            cities: (..., n, 2) float, node coordinates relative to the deciding agent; row 0 is the depot.
+            agents: (..., m, 3) float, destinations relative to it, and remaining travel times.
+            visited: (..., n) bool, the global mask M, False at the depot.
+            agent: (...) int64, the deciding agent's index: others may stand at the same place.
+
+        Returns:
+            (..., n) float, in [-C, C]; -C at visited nodes and out of view.
+        """
+        lead, n = visited.shape[:-1], visited.shape[-1]
+        cities, agents, visited, agent = _rows(cities, agents, visited, agent)
+        h_agents, h_nodes, kept = self._encode(cities, agents, visited, agent)
+        h_decider = _gather(h_agents, agent[:, None])  # (B, 1, d)
+        logits = self._next(h_decider, h_nodes)  # (B, 1, k)
+        return _scatter(logits, kept, visited, -self.config.tanh_clip).reshape(*lead, n)
+
+    def forward_dense(self, cities: Tensor, agents: Tensor, visited: Tensor, agent: Tensor) -> DenseLogits:
+        """The policy, what all agents do next, and who visits each city. The arguments are those of ``forward``.
+
+        The policy is the deciding agent's row of ``next``. At visited nodes and out of view, ``next`` is -C and
+        ``assignment`` is 0.
+        """
+        lead, m, n = visited.shape[:-1], agents.shape[-2], visited.shape[-1]
+        cities, agents, visited, agent = _rows(cities, agents, visited, agent)
+        h_agents, h_nodes, kept = self._encode(cities, agents, visited, agent)
+        next_logits = self._next(h_agents, h_nodes)  # (B, m, k)
+        assignment = _products(self.assignment_query(h_agents), self.assignment_key(h_nodes))  # (B, m, k)
+        next_logits = _scatter(next_logits, kept, visited, -self.config.tanh_clip)  # (B, m, n)
+        assignment = _scatter(assignment, kept, visited, 0.0)  # (B, m, n)
+        policy = _gather(next_logits, agent[:, None])  # (B, 1, n)
+        return DenseLogits(policy.reshape(*lead, n), next_logits.reshape(*lead, m, n), assignment.reshape(*lead, m, n))
+
+    def _encode(self, cities: Tensor, agents: Tensor, visited: Tensor, agent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Embeddings of the agents (B, m, d) and of the nodes in view (B, k, d), and those nodes' indices (B, k)."""
+        m = agents.shape[1]
+        kept, real = open_nodes(cities, visited, self.config.view, other_tokens=m)  # (B, k), the depot first
+        seen = _gather(cities, kept)  # (B, k, 2)
+        decides = torch.arange(m, device=agent.device) == agent[:, None]  # (B, m)
+        h_agents = self.embed_agent(agents) + decides[:, :, None] * self.decider
+        h = torch.cat([h_agents, self.embed_depot(seen[:, :1]), self.embed_city(seen[:, 1:])], dim=1)  # (B, m + k, d)
+        mask = None if real is None else torch.cat([torch.ones_like(decides), real], dim=1)  # (B, m + k)
+        for layer in self.layers:
+            h = layer(h, h, mask)
+        h = self.norm(h)
+        return h[:, :m], h[:, m:], kept
+
+    def _next(self, h_agents: Tensor, h_nodes: Tensor) -> Tensor:
+        """(B, m, d), (B, k, d) -> (B, m, k) logits in [-C, C]."""
+        return self.config.tanh_clip * torch.tanh(_products(self.next_query(h_agents), self.next_key(h_nodes)))
+
+
+def _products(query: Tensor, key: Tensor) -> Tensor:
+    """q.k / sqrt(d) of (B, m, d) and (B, k, d) -> (B, m, k), at least float32: bfloat16 is too coarse for logits."""
+    u = (query @ key.transpose(1, 2)) / query.shape[-1] ** 0.5
+    return u.to(torch.promote_types(u.dtype, torch.float32))
+
+
+def _rows(cities: Tensor, agents: Tensor, visited: Tensor, agent: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The observations with one leading dimension B."""
+    n, m = visited.shape[-1], agents.shape[-2]
+    return cities.reshape(-1, n, 2), agents.reshape(-1, m, 3), visited.reshape(-1, n), agent.reshape(-1)
+
+
+def _gather(h: Tensor, indices: Tensor) -> Tensor:
+    """Entries ``indices`` (B, k) of h (B, n, d) -> (B, k, d)."""
+    return h.gather(1, indices[:, :, None].expand(-1, -1, h.shape[2]))
+
+
+def _scatter(logits: Tensor, kept: Tensor, visited: Tensor, fill: float) -> Tensor:
+    """Puts logits (B, m, k) at their nodes ``kept`` (B, k) -> (B, m, n), with ``fill`` at visited and other nodes."""
+    shape = (*logits.shape[:2], visited.shape[1])
+    whole = logits.new_full(shape, fill).scatter(2, kept[:, None].expand(-1, logits.shape[1], -1), logits)
+    return whole.masked_fill(visited[:, None], fill)

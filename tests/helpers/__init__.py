@@ -1,0 +1,1 @@
+"""What several tests share: the oracle, the faces held against it, random games, odd instances."""

@@ -1,0 +1,185 @@
+"""JointDAN: symmetries, view, pruning, precision, dense outputs, gradients."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from dan_policy import layers
+from dan_policy.joint import JointConfig, JointDAN
+
+SMALL = JointConfig(embed_dim=16, feedforward_dim=32, n_heads=2, n_layers=2)
+CONFIGS = {"small": SMALL, "default": JointConfig(), "short-sighted": replace(SMALL, view=3)}
+
+
+@pytest.fixture(params=CONFIGS)
+def network(request):
+    torch.manual_seed(0)
+    return JointDAN(CONFIGS[request.param]).eval()
+
+
+@pytest.fixture
+def small():
+    torch.manual_seed(0)
+    return JointDAN(SMALL).eval()
+
+
+def observation(batch=5, n=9, m=4, seed=0, dtype=torch.float32):
+    """Cities, agents, visited and agent. Two agents stand at the decider's place, so that only its index tells it."""
+    generator = torch.Generator().manual_seed(seed)
+    cities = torch.rand(batch, n, 2, generator=generator, dtype=torch.float64) * 2 - 1
+    agents = torch.rand(batch, m, 3, generator=generator, dtype=torch.float64)
+    agents[:, :2] = 0.0
+    visited = torch.rand(batch, n, generator=generator) < 0.4
+    visited[:, 0] = False
+    agent = torch.randint(2, (batch,), generator=generator)
+    return cities.to(dtype), agents.to(dtype), visited, agent
+
+
+def test_permuting_cities_permutes_logits(network):
+    cities, agents, visited, agent = observation()
+    order = torch.cat([torch.zeros(1, dtype=torch.int64), torch.randperm(8) + 1])  # the depot has its own embedding
+    logits = network(cities, agents, visited, agent)
+    permuted = network(cities[:, order], agents, visited[:, order], agent)
+    assert torch.allclose(permuted, logits[:, order], atol=1e-5)
+    assert not torch.allclose(permuted, logits, atol=1e-3)
+
+
+def test_permuting_agents_changes_nothing_for_the_decider_and_permutes_dense_rows(network):
+    cities, agents, visited, agent = observation()
+    order = torch.tensor([2, 0, 3, 1])
+    moved = (order[None] == agent[:, None]).int().argmax(1)  # the decider's new index
+    logits = network(cities, agents, visited, agent)
+    assert torch.allclose(network(cities, agents[:, order], visited, moved), logits, atol=1e-5)
+    dense = network.forward_dense(cities, agents, visited, agent)
+    permuted = network.forward_dense(cities, agents[:, order], visited, moved)
+    for before, after in zip(dense[1:], permuted[1:], strict=True):
+        assert torch.allclose(after, before[:, order], atol=1e-5)
+
+
+def test_the_index_tells_the_decider_from_an_agent_at_the_same_place(network):
+    cities, agents, visited, agent = observation()
+    agents[:, 1, 2] = 0.5  # agents 0 and 1 head for the same place, and agent 1 has yet to arrive
+    first, second = (network(cities, agents, visited, torch.full_like(agent, index)) for index in (0, 1))
+    assert not torch.allclose(first, second, atol=1e-4)
+
+
+def test_agents_matter(network):
+    cities, agents, visited, agent = observation()
+    assert not torch.allclose(
+        network(cities, agents, visited, agent), network(cities, agents + 0.5, visited, agent), atol=1e-4
+    )
+
+
+def test_the_deciders_row_of_the_dense_logits_is_the_policy(network):
+    cities, agents, visited, agent = observation()
+    dense = network.forward_dense(cities, agents, visited, agent)
+    assert dense.next.shape == dense.assignment.shape == (5, 4, 9)
+    assert torch.equal(dense.policy, dense.next[torch.arange(5), agent])
+    assert torch.allclose(network(cities, agents, visited, agent), dense.policy, atol=1e-5)
+
+
+def test_a_batch_equals_its_rows_alone(network):
+    together = network(*observation())
+    for row in range(5):
+        alone = network(*(part[row : row + 1] for part in observation()))
+        assert torch.allclose(alone, together[row : row + 1], atol=1e-5)
+
+
+def test_leading_dimensions_are_free(network):
+    flat = observation(batch=6)
+    shaped = [part.unflatten(0, (2, 3)) for part in flat]
+    assert torch.equal(network(*shaped), network(*flat).unflatten(0, (2, 3)))
+    assert torch.allclose(network(*(part[0] for part in flat)), network(*flat)[0], atol=1e-5)
+    dense = network.forward_dense(*shaped)
+    assert dense.policy.shape == (2, 3, 9) and dense.next.shape == dense.assignment.shape == (2, 3, 4, 9)
+
+
+def test_pruning_equals_removing_the_visited_cities(small):
+    cities, agents, visited, agent = observation()
+    logits = small(cities, agents, visited, agent)
+    assert (logits[visited] == -SMALL.tanh_clip).all()
+    moved = torch.where(visited[:, :, None], cities + 0.3, cities)
+    assert torch.equal(small(moved, agents, visited, agent), logits)
+    for row in range(len(cities)):
+        one, is_open = slice(row, row + 1), ~visited[row]
+        alone = small(cities[one, is_open], agents[one], visited[one, is_open], agent[one])
+        assert torch.allclose(logits[one, is_open], alone, atol=1e-5)
+
+
+def test_a_view_holds_the_nearest_unvisited_cities(small):
+    """As if the others were not there; those get the least logit, so that they stay legal."""
+    cities, agents, visited, agent = observation(n=30)
+    small.config = replace(SMALL, view=6)
+    logits = small(cities, agents, visited, agent)
+    dense = small.forward_dense(cities, agents, visited, agent)
+    for row in range(len(cities)):
+        distance = cities[row].square().sum(1).where(~visited[row], torch.inf)
+        distance[0] = -1.0
+        seen = distance.argsort()[:7].sort().values  # the depot and six cities
+        one = slice(row, row + 1)
+        alone = small(cities[one, seen], agents[one], visited[one, seen], agent[one])
+        assert torch.allclose(logits[one, seen], alone, atol=1e-5)
+        hidden = [node for node in range(30) if node not in seen]
+        assert (logits[row, hidden] == -SMALL.tanh_clip).all()
+        assert (dense.next[row, :, hidden] == -SMALL.tanh_clip).all()
+        assert (dense.assignment[row, :, hidden] == 0.0).all()
+
+
+def test_a_view_of_all_cities_hides_none(small):
+    seen = small(*observation())
+    small.config = replace(SMALL, view=8)
+    assert torch.equal(small(*observation()), seen)
+
+
+def test_padding_for_bfloat16_changes_nothing(small, monkeypatch):
+    cities, agents, visited, agent = observation(n=30)
+    visited[:, 11:] = True
+    exact = small(cities, agents, visited, agent)
+    with torch.autocast("cpu", torch.bfloat16):
+        padded = small(cities, agents, visited, agent)
+        monkeypatch.setattr(layers, "padded_length", lambda length: length)
+        unpadded = small(cities, agents, visited, agent)
+    assert padded.dtype == torch.float32
+    assert torch.allclose(padded, unpadded, atol=0.05)
+    assert torch.allclose(padded, exact, atol=0.3)
+
+
+def test_float32_agrees_with_float64(network):
+    single = network(*observation())
+    double = network.double()(*observation(dtype=torch.float64))
+    assert torch.allclose(single.double(), double, atol=1e-4)
+
+
+def test_logits_stay_within_the_clip(network):
+    cities, agents, visited, agent = observation()
+    assert network(cities * 100, agents * 100, visited, agent).abs().max() <= network.config.tanh_clip
+
+
+def test_dense_gradients_reach_every_parameter_and_the_policys_all_but_the_assignments(network):
+    dense = network.forward_dense(*observation())
+    (dense.next.square().sum() + dense.assignment.square().sum()).backward()
+    for name, parameter in network.named_parameters():
+        assert parameter.grad is not None and parameter.grad.abs().max() > 0, name
+    network.zero_grad()
+    network(*observation()).square().sum().backward()
+    unused = {name for name, parameter in network.named_parameters() if parameter.grad is None}
+    assert unused == {"assignment_query.weight", "assignment_key.weight"}
+
+
+def test_the_default_has_about_a_million_parameters():
+    assert sum(p.numel() for p in JointDAN().parameters()) == pytest.approx(1.06e6, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"n_heads": 3}, "n_heads must divide embed_dim=128, got 3"),
+        ({"n_layers": 0}, "n_layers must be a whole number of at least 1, got 0"),
+        ({"tanh_clip": 0.0}, "tanh_clip must be above 0, got 0.0"),
+        ({"view": 0}, "view must be None or at least 1 city, got 0"),
+    ],
+)
+def test_bad_configurations_are_named(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        JointConfig(**kwargs)
