@@ -81,6 +81,22 @@ def minus(points: Array, origin: Array) -> Array:
     return difference.view(np.float32).reshape(points.shape)
 
 
+def append(points: Array, values: Array) -> Array:
+    """(B, k, 3) Points (B, k, 2) with ``values`` (B, k) as their third component, in the points' dtype."""
+    if type(points) is not np.ndarray:
+        xp, _ = library(points)
+        return xp.concat([points, xp.astype(values, points.dtype)[:, :, None]], axis=2)
+    joined = np.empty((*values.shape, 3), points.dtype)
+    joined[..., :2] = points
+    joined[..., 2] = values
+    return joined
+
+
+def at_least(array: Array, low: float) -> Array:
+    """The array with everything below ``low`` raised to it."""
+    return np.maximum(array, low) if type(array) is np.ndarray else array.clamp(min=low)
+
+
 def norm(vector: Array) -> Array:
     """(...) Lengths of the vectors (..., 2)."""
     square = vector * vector

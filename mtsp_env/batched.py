@@ -22,7 +22,7 @@ from mtsp_env import rules
 from mtsp_env.arrays import library
 from mtsp_env.checks import check_count
 from mtsp_env.distributions import Generator, check_distribution, sample
-from mtsp_env.instance import FIELDS, Array, ArrayField, Problem, Tours, check_arrays
+from mtsp_env.instance import FIELDS, ArrayField, Problem, Tours, check_arrays
 
 Arrays = dict[str, "torch.Tensor"]
 
@@ -57,7 +57,8 @@ class BatchedMTSP(EnvBase):
     Args:
         n_nodes, n_agents, speed, depot, reward, max_decisions, distribution: as for ``mtsp_v0.raw_env``.
         batch_size: B or [B].
-        device: where the games live, "cpu" or "cuda".
+        device: where the games live, "cpu" or "cuda". None: on the CPU, in TensorDicts without a device, which TorchRL
+            makes a little faster.
         seed: of the instances; a row's instance depends on the order of resets alone.
         check_actions: raise ValueError on an illegal action. On a GPU this waits for the device at each step: switch it
             off if the policy is masked.
@@ -80,7 +81,7 @@ class BatchedMTSP(EnvBase):
         reward: rules.Reward = "sparse",
         max_decisions: int | None = None,
         distribution: str | Generator = "uniform",
-        device: torch.device | str = "cpu",
+        device: torch.device | str | None = None,
         seed: int | None = None,
         check_actions: bool = True,
     ):
@@ -95,7 +96,9 @@ class BatchedMTSP(EnvBase):
         self.check_actions = check_actions
         self._rng = np.random.default_rng(seed)
         self._last: TensorDictBase | None = None  # for tours()
-        self._in_numpy = torch.device(device).type == "cpu"
+        self._on_cpu = device is None or torch.device(device).type == "cpu"
+        self._in_numpy = self._on_cpu
+        self._numpy_views: dict[str, tuple[torch.Tensor, np.ndarray]] = {}
         self._advance: Callable[[dict], tuple[dict, dict]] = self._decide
         self._make_specs()
 
@@ -152,7 +155,7 @@ class BatchedMTSP(EnvBase):
             self._advance = advance
         except Exception as error:  # compilers fail in many ways; an illegal action was refused before
             warnings.warn(f"torch.compile failed, the rules run without it: {_first_line(error)}", stacklevel=5)
-            self._advance, self._in_numpy = self._decide, self.device.type == "cpu"
+            self._advance, self._in_numpy = self._decide, self._on_cpu
             outputs = self._decide(self._library(arrays))
         return outputs
 
@@ -211,33 +214,42 @@ class BatchedMTSP(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = self._checked_action(tensordict)
-        arrays = self._library({**dict(tensordict.get("game").items()), "action": action})
-        return self._tensordict(self._advance(arrays))
+        return self._tensordict(
+            self._advance(self._library({**dict(tensordict.get("game").items()), "action": action}))
+        )
 
     def _decide(self, arrays: dict) -> tuple[dict, dict]:
         """One decision in every row: arrays of the game and ``action`` -> what ``_outputs`` returns."""
         before = rules.state_from_arrays(arrays, self.n_agents)
-        after = rules.depart(before, self.rules, arrays["action"])
-        return self._outputs(after, rules.reward(before, after, self.rules))
+        return self._outputs(rules.depart(before, self.rules, arrays["action"]), before)
 
-    def _outputs(self, state: rules.State, reward: Array | None = None) -> tuple[dict, dict]:
-        """Arrays at the root and arrays of the game."""
+    def _outputs(self, state: rules.State, before: rules.State | None = None) -> tuple[dict, dict]:
+        """Arrays at the root and arrays of the game; with the state before, also the reward of the decision."""
         terminated, truncated = rules.all_visited(state), rules.truncated(state, self.rules)
-        over = {"done": terminated | truncated, "terminated": terminated, "truncated": truncated}
-        root = {**rules.observe(state, self.rules)._asdict(), **{key: flag[:, None] for key, flag in over.items()}}
-        if reward is not None:
-            xp, _ = library(reward)
-            root["reward"] = xp.astype(reward, xp.float32)[:, None]
+        over = terminated | truncated
+        root = rules.observe(state, self.rules)._asdict()
+        root |= {"done": over[:, None], "terminated": terminated[:, None], "truncated": truncated[:, None]}
+        if before is not None:
+            reward = rules.reward(before, state, self.rules, over)
+            root["reward"] = library(reward)[0].astype(reward, library(reward)[0].float32)[:, None]
         return root, state.arrays()
 
     def _library(self, arrays: Arrays) -> dict:
         """The same memory as arrays of the library in which the rules run."""
-        return {key: value.numpy() for key, value in arrays.items()} if self._in_numpy else arrays
+        if not self._in_numpy:
+            return arrays
+        known = self._numpy_views  # of the last step's tensors: most steps go on from these
+        return {
+            key: known[key][1] if key in known and known[key][0] is tensor else tensor.numpy()
+            for key, tensor in arrays.items()
+        }
 
     def _tensordict(self, outputs: tuple[dict, dict]) -> TensorDictBase:
         root, game = outputs
         if self._in_numpy:
-            root, game = ({key: torch.from_numpy(array) for key, array in part.items()} for part in (root, game))
+            root = {key: torch.from_numpy(array) for key, array in root.items()}
+            self._numpy_views = {key: (torch.from_numpy(array), array) for key, array in game.items()}
+            game = {key: tensor for key, (tensor, _) in self._numpy_views.items()}
         same = {"batch_size": self.batch_size, "device": self.device}
         self._last = TensorDict({**root, "game": TensorDict(game, **same)}, **same)
         return self._last
@@ -251,7 +263,8 @@ class BatchedMTSP(EnvBase):
                 f"action must be whole numbers of shape {tuple(self.batch_size)}, got {action.dtype} of shape "
                 f"{tuple(action.shape)}"
             )
-        action = action.to(torch.int64).contiguous()
+        if action.dtype != torch.int64 or not action.is_contiguous():
+            action = action.to(torch.int64).contiguous()
         if self.check_actions:
             self._check_legal(tensordict, action)
         return action

@@ -15,7 +15,7 @@ from typing import Annotated, Literal, NamedTuple, get_type_hints
 
 import numpy as np
 
-from mtsp_env.arrays import indices, library, locate, minus, norm, pick, pick_many, put
+from mtsp_env.arrays import append, at_least, indices, library, locate, minus, norm, pick, pick_many, put
 from mtsp_env.checks import check_count
 from mtsp_env.instance import FIELDS, Array, ArrayField, Problem, Tours, check_plain
 
@@ -76,7 +76,6 @@ class State(NamedTuple):
 
     problem: Problem
     seen_nodes: Annotated[Array, ArrayField("float32", ("n", 2), "the nodes, as observations are computed from them")]
-    home: Annotated[Array, ArrayField("float64", ("n",), "distance from each node to the depot")]
     visited: Annotated[
         Array,
         ArrayField("bool", ("n",), "the global mask M: a city counts once an agent sets off for it, the depot never"),
@@ -137,11 +136,9 @@ def start(problem: Problem) -> State:
     def zeros(*shape: int, dtype: object = xp.int64) -> Array:
         return xp.zeros(shape, dtype=dtype, device=on)
 
-    home = norm(nodes - nodes[:, :1])
     return State(
         problem=problem,
         seen_nodes=xp.astype(nodes, xp.float32),
-        home=home,
         visited=zeros(batch, n_nodes, dtype=xp.bool),
         cities_left=zeros(batch) + (n_nodes - 1),
         visits=zeros(batch, n_nodes, dtype=xp.int32) - 1,
@@ -191,6 +188,8 @@ def legal_actions(state: State, rules: Rules, agent: Array) -> Array:
 def are_legal(action: Array, action_mask: Array) -> Array:
     """(B,) bool: whether each ``action`` (B,) is a node that its row of ``action_mask`` (B, n) allows."""
     n_nodes = action_mask.shape[1]
+    if type(action) is np.ndarray and action.min() >= 0 and action.max() < n_nodes:
+        return pick(action_mask, locate(action, n_nodes))
     inside = (action >= 0) & (action < n_nodes)
     return inside & pick(action_mask, locate(action * inside, n_nodes))
 
@@ -212,11 +211,11 @@ def observe(state: State, rules: Rules, agent: Array | None = None) -> Observati
 
     before = indices(state.ready, axis=1) < agent[:, None]  # (B, m): j < i
     elapsed = xp.astype(tick[:, None] + before - state.departed, xp.float64) + TICK_TOLERANCE
-    remaining = (state.leg - rules.speed * elapsed).clip(0.0)  # (B, m)
+    remaining = at_least(state.leg - rules.speed * elapsed, 0.0)  # (B, m)
 
     return Observation(
         cities=cities,
-        agents=xp.concat([heading, xp.astype(remaining, xp.float32)[:, :, None]], axis=2),
+        agents=append(heading, remaining),
         visited=state.visited,
         action_mask=legal_actions(state, rules, agent),
         agent=agent,
@@ -240,7 +239,6 @@ def depart(state: State, rules: Rules, action: Array, agent: Array | None = None
     return State(
         problem=state.problem,
         seen_nodes=state.seen_nodes,
-        home=state.home,
         visited=put(state.visited, goal, is_city),
         cities_left=state.cities_left + ~is_city - 1,
         visits=put(state.visits, goal, _visit_code(n_nodes - state.cities_left, agent, here == 0, n_agents)),
@@ -257,12 +255,14 @@ def depart(state: State, rules: Rules, action: Array, agent: Array | None = None
 def travel_ticks(leg: Array, speed: float) -> Array:
     """Ticks that a leg takes: max(1, ceil(leg / speed)), int64. A stay takes one tick."""
     xp, _ = library(leg)
-    return xp.astype(xp.ceil(leg / speed - TICK_TOLERANCE).clip(1.0), xp.int64)
+    return xp.astype(at_least(xp.ceil(leg / speed - TICK_TOLERANCE), 1.0), xp.int64)
 
 
 def makespan(state: State) -> Array:
     """(B,) float64: the longest tour so far, every agent's return leg counted."""
-    return library(state.length)[0].max(state.length + pick_many(state.home, state.destination), axis=1)
+    nodes = state.problem.nodes
+    way_home = norm(pick_many(nodes, state.destination) - nodes[:, :1])  # (B, m)
+    return library(state.length)[0].max(state.length + way_home, axis=1)
 
 
 def truncated(state: State, rules: Rules) -> Array:
@@ -278,16 +278,19 @@ def final_cost(state: State, rules: Rules) -> Array:
     cost, cut_off = makespan(state), truncated(state, rules)
     if type(cut_off) is np.ndarray and not cut_off.any():
         return cost
-    xp, _ = library(cost)
-    trips = xp.sum(xp.where(state.visited, 0.0, 2.0 * state.home), axis=1)
+    xp, nodes = library(cost)[0], state.problem.nodes
+    trips = xp.sum(xp.where(state.visited, 0.0, 2.0 * norm(nodes - nodes[:, :1])), axis=1)
     return cost + xp.where(cut_off, trips, 0.0)
 
 
-def reward(before: State, after: State, rules: Rules) -> Array:
-    """(B,) float64: what the decision between two states pays to every agent alike (paper, Sec. 4, Reward)."""
+def reward(before: State, after: State, rules: Rules, over: Array | None = None) -> Array:
+    """(B,) float64: what the decision between two states pays to every agent alike (paper, Sec. 4, Reward).
+
+    ``over`` (B,) bool says whether the game is over after it, if that is known already.
+    """
     if rules.reward == "shaped":
         return makespan(before) - final_cost(after, rules)
-    over = all_visited(after) | truncated(after, rules)
+    over = all_visited(after) | truncated(after, rules) if over is None else over
     if type(over) is np.ndarray and not over.any():
         return np.zeros(len(over))  # most decisions: nothing to work out
     cost = final_cost(after, rules)

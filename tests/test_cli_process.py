@@ -108,15 +108,15 @@ from torch import nn
 
 
 class Polar(nn.Module):
-    in_keys = ("cities", ("game", "home"))
+    in_keys = ("cities", ("game", "visits"))
 
     def __init__(self, width=4):
         super().__init__()
         self.layers = nn.Sequential(nn.Linear(3, width), nn.Tanh(), nn.Linear(width, 1))
 
-    def forward(self, cities, home):
+    def forward(self, cities, visits):
         x, y = cities.unbind(-1)
-        polar = torch.stack([torch.hypot(x, y), torch.atan2(y, x), home.to(x.dtype)], dim=-1)
+        polar = torch.stack([torch.hypot(x, y), torch.atan2(y, x), visits.to(x.dtype)], dim=-1)
         return self.layers(polar)[..., 0]
 
 

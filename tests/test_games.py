@@ -14,12 +14,12 @@ from mtsp_env.batched import BatchedMTSP
 GAME = rules.make_rules(15, 3, SPEED, "final", "sparse", None)
 
 
-def scattered(cities, agents, visited, home):
+def scattered(cities, agents, visited, visits):
     """Logits that depend on the whole observation and on the state."""
-    return torch.sin(20 * cities.sum(-1) + agents.sum((-1, -2))[:, None] + home.to(cities.dtype)) - visited.float()
+    return torch.sin(20 * cities.sum(-1) + agents.sum((-1, -2))[:, None] + visits.to(cities.dtype)) - visited.float()
 
 
-scattered.in_keys = ("cities", "agents", "visited", ("game", "home"))
+scattered.in_keys = ("cities", "agents", "visited", ("game", "visits"))
 
 
 def in_torch(state):

@@ -257,24 +257,24 @@ class OwnConfig:
 class Own(nn.Module):
     """A network of one's own: an observation of its own, a dataclass as its config, and dropout."""
 
-    in_keys = ("cities", ("game", "home"), "agent")
+    in_keys = ("cities", ("game", "visits"), "agent")
 
     def __init__(self, config=None):
         super().__init__()
         self.config, self.seen = config or OwnConfig(), []
         self.layer, self.dropout = nn.Linear(2, 1), nn.Dropout(0.5)
 
-    def forward(self, cities, home, agent):
+    def forward(self, cities, visits, agent):
         self.seen.append(self.config)
-        distance = torch.stack([cities.norm(dim=-1), home.to(cities.dtype)], dim=-1)  # (B, n, 2)
+        distance = torch.stack([cities.norm(dim=-1), visits.to(cities.dtype)], dim=-1)  # (B, n, 2)
         return self.config.tanh_clip * torch.tanh(self.dropout(self.layer(distance))[..., 0] + agent[:, None])
 
 
-def own_function(cities, home):
-    return -cities.norm(dim=-1) - home
+def own_function(cities, visits):
+    return -cities.norm(dim=-1) - visits
 
 
-own_function.in_keys = ("cities", ("game", "home"))
+own_function.in_keys = ("cities", ("game", "visits"))
 
 
 @pytest.mark.parametrize("options", [{}, {"decode": "sample", "samples": 5}, {"augment": True}])
@@ -356,7 +356,7 @@ reads_what_does_not_exist.in_keys = ("weather",)
         (lambda cities, agents, visited: cities, r"logits of shape \(1, 6\), got \(1, 6, 2\)"),
         (lambda cities, agents, visited: cities[..., 0] * torch.nan, "logits must be finite .*, got nan"),
         (lambda cities, agents, visited: cities[..., 0] - torch.inf, "logits must be finite .*, got -inf"),
-        (reads_what_does_not_exist, "the network reads 'weather'; choose from .*'cities'.*'home'"),
+        (reads_what_does_not_exist, "the network reads 'weather'; choose from .*'cities'.*'visits'"),
     ],
 )
 def test_policies_that_make_no_sense_are_named(policy, message):
