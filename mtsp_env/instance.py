@@ -144,6 +144,15 @@ class Instance:
         return Instance, self._values()  # NumPy unpickles arrays as writable
 
 
+def describe_fields(described: Mapping[str, ArrayField]) -> str:
+    """A Markdown table of array fields: names, shapes for one instance, dtypes and meanings."""
+    rows = [
+        f"| `{name}` | ({', '.join(map(str, field.shape))}) | {field.dtype} | {field.meaning} |"
+        for name, field in described.items()
+    ]
+    return "\n".join(["| field | shape | dtype | meaning |", "|---|---|---|---|", *rows])
+
+
 FIELDS: dict[str, ArrayField] = {each.name: each.metadata["array"] for each in fields(Instance) if each.metadata}
 WORLD_FIELDS: tuple[str, ...] = tuple(name for name in FIELDS if name != "nodes")
 

@@ -18,7 +18,9 @@ from mtsp_env.batched import BatchedMTSP, masked_random_policy, random_legal_act
 GAME = [("game", key) for key in ("nodes", *rules.STATE_FIELDS)]
 DEVICES = [
     "cpu",
-    pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")),
+    pytest.param(
+        "cuda", marks=[pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
+    ),
 ]
 
 
@@ -261,6 +263,7 @@ def test_a_step_changes_nothing_that_came_before():
 
 
 @pytest.mark.parametrize("kind", [SerialEnv, ParallelEnv])
+@pytest.mark.slow
 def test_the_masked_random_policy_plays_in_environments_of_workers(kind):
     """Each worker's games, and their seeds, are its own; nobody takes an illegal action."""
     env = kind(2, partial(BatchedMTSP, 7, 2, 3, depot="final"))

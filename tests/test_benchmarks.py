@@ -102,6 +102,7 @@ def test_results_give_their_better_tours(tmp_path):
     assert best_known.merge_rows([], folder=tmp_path) == []
 
 
+@pytest.mark.slow
 def test_the_search_improves_and_the_check_counts_what_is_proved(tmp_path):
     instances = CELL.instances(7)
     best_known.merge(CELL, 7, {k: one_agent_does_it_all(i) for k, i in enumerate(instances)}, tmp_path)
@@ -199,6 +200,7 @@ def test_solving_is_timed_and_its_memory_is_measured(monkeypatch):
     assert 10 * 2**20 < before <= cost.memory_before <= cost.memory == speed_solve.peak_memory() < 100 * 2**30
 
 
+@pytest.mark.slow
 def test_every_speed_is_measured():
     small = DAN(DANConfig(embed_dim=8, feedforward_dim=8, n_heads=1, city_layers=1))
     rate, flops = speed.greedy_instances(small, "cpu", 0.01)

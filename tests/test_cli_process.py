@@ -45,6 +45,7 @@ def test_help_needs_nothing_heavy() -> None:
         assert "usage: mtsp" in done.stdout and "example" in done.stdout
 
 
+@pytest.mark.slow
 def test_the_reference_alone_needs_no_torch(folder, square: Instance) -> None:
     pytest.importorskip("numba", reason="needs the extra reference")
     argv = ("solve", "square.json", "--method", "reference", "--seed", "3")
@@ -132,6 +133,7 @@ def make_nearest():
 """
 
 
+@pytest.mark.slow
 def test_a_network_of_ones_own_solves_from_a_directory_outside_the_checkout(folder) -> None:
     """A module with its weights in a file, and a plain function, both from a file in the working directory."""
     Path("own_networks.py").write_text(OWN)

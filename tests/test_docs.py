@@ -15,6 +15,8 @@ from pathlib import Path
 import pytest
 
 from dan_policy.cli import main
+from mtsp_env.instance import FIELDS, describe_fields
+from mtsp_env.rules import STATE_FIELDS
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -93,6 +95,7 @@ def help_of(program: tuple[str, ...]) -> str:
 
 
 @pytest.mark.parametrize(("page", "example"), python_examples())
+@pytest.mark.slow
 def test_examples_run(page: Path, example: str, tmp_path: Path) -> None:
     result = run([sys.executable, "-W", "ignore", "-c", example], folder_of(page, tmp_path))
     assert result.returncode == 0, result.stderr
@@ -138,6 +141,11 @@ def test_commands_and_options_exist(page: Path) -> None:
 def test_commands_are_found_in_pages() -> None:
     programs = {program_and_options(words)[0] for words in command_lines(ROOT / "README.md")}
     assert {("mtsp", "solve"), ("-m", "train", "imitate"), ("-m", "train", "reinforce", "quick")} <= programs
+
+
+@pytest.mark.parametrize("fields", [FIELDS, STATE_FIELDS], ids=["problem", "state"])
+def test_the_fields_are_documented_as_they_are(fields: dict) -> None:
+    assert describe_fields(fields) in (ROOT / "docs" / "problem.md").read_text(encoding="utf-8")
 
 
 def test_the_readme_is_short() -> None:

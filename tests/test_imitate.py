@@ -218,6 +218,7 @@ def test_the_learning_rate_warms_up_and_falls_to_its_end():
     assert rates[:10] == sorted(rates[:10]) and rates[10:] == sorted(rates[10:], reverse=True)
 
 
+@pytest.mark.slow
 def test_resume_is_bit_identical(tmp_path, monkeypatch, student):
     imitate(replace(student, out=tmp_path / "whole"))
 

@@ -56,6 +56,7 @@ def test_gaps_are_to_the_best_known_tours():
         ),
     ],
 )
+@pytest.mark.slow
 def test_a_variant_is_trained_in_its_stages(small, tmp_path, variant, stages):
     found = ablations.train_and_evaluate(variant, 1.0, 0, tmp_path)
     assert (found["imitation_steps"] > 0, found["reinforce_steps"] > 0) == stages
@@ -82,6 +83,7 @@ def test_verdicts_are_kept_and_not_mixed(tmp_path, monkeypatch, capsys):
     assert not (tmp_path / "table.md").exists()
 
 
+@pytest.mark.slow
 def test_curves_go_on_until_their_time_is_over(small, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(curves, "QUICK", replace(QUICK, batch_size=4, challenge_instances=4))
     taught, reinforced = curves.imitate, curves.reinforce

@@ -55,6 +55,7 @@ def check_solves_europe(file: Path) -> None:
     check_tours(instance, tours)
 
 
+@pytest.mark.slow
 def test_it_is_trained_validated_and_solves(folder):
     pytest.importorskip("numba", reason="the teacher is compiled with Numba")
     size = "--n-nodes 8 10 --n-agents 2 2 --nodes-per-agent 2"

@@ -161,6 +161,7 @@ def test_resume_is_bit_identical(tmp_path, monkeypatch):
     assert load(tmp_path / "whole" / "best.safetensors").config == JOINT
 
 
+@pytest.mark.slow
 def test_imitation_of_plans_learns_what_the_teacher_does(tmp_path):
     """120 steps at n = 10, m = 2 lower the greedy cost on held-out instances."""
     config = replace(

@@ -43,6 +43,7 @@ def odd_games(draw: st.DrawFn) -> Game:
 
 @settings(max_examples=250, deadline=None, derandomize=True, database=None)
 @given(odd_games())
+@pytest.mark.slow
 def test_odd_games_are_algorithm_1s(game: Game) -> None:
     traces = play(game)
     for face in FACES:

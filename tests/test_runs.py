@@ -18,6 +18,7 @@ from train.reinforce import ReinforceLearner, reinforce
 
 
 @pytest.mark.parametrize("average", [0.0, 0.9])
+@pytest.mark.slow
 def test_resume_is_bit_identical(tmp_path, average):
     config = replace(TINY, average=average)
     reinforce(replace(config, out=tmp_path / "whole"))

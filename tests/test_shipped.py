@@ -16,6 +16,7 @@ def test_there_is_a_default_with_a_card():
 
 
 @pytest.mark.parametrize("name", registry.shipped())
+@pytest.mark.slow
 def test_shipped_models_beat_nearest(name):
     network = load(name)
     instances = [uniform(np.random.default_rng([11, k]), 25, 4) for k in range(40)]

@@ -39,6 +39,7 @@ def test_the_table_compares_with_the_c_in_use(tmp_path, capsys) -> None:
     assert main(["sweep-clip", "--sizes", "50"]) == 2 and "such as 50x5, got '50'" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_table_compares_with_seeing_everything(tmp_path) -> None:
     """Views that are not smaller than the instance are left out; smaller ones give other tours."""
     out = tmp_path / "view.md"
