@@ -109,10 +109,10 @@ class DAN(nn.Module):
 
     def _pruned_logits(self, cities: Tensor, agents: Tensor, visited: Tensor) -> Tensor:
         """Gathers each row's nodes in view, and scatters their logits back."""
-        kept, real = open_nodes(cities, visited, self.config.view)  # (B, k)
-        seen = cities.gather(1, kept[:, :, None].expand(-1, -1, 2))  # (B, k, 2)
+        in_view, real = open_nodes(cities, visited, self.config.view)  # (B, k)
+        seen = cities.gather(1, in_view[:, :, None].expand(-1, -1, 2))  # (B, k, 2)
         logits = self._logits(seen, agents, real, unvisited=real)
-        return logits.new_full(visited.shape, -self.config.tanh_clip).scatter(1, kept, logits)
+        return logits.new_full(visited.shape, -self.config.tanh_clip).scatter(1, in_view, logits)
 
     def _logits(self, cities: Tensor, agents: Tensor, real: Tensor | None, unvisited: Tensor | None) -> Tensor:
         """cities (B, k, 2), agents (B, m, 3) -> (B, k).

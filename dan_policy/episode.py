@@ -71,7 +71,7 @@ def rollout(
         raise ValueError(f"unknown decode {decode!r}; choose from {sorted(EXPLORATION)}")
     actor = as_actor(policy)
     td = env.reset() if instances is None else env.reset(_as_tensordict(instances, env), set_state=True)
-    kept: list[TensorDictBase] = []
+    decisions: list[TensorDictBase] = []
     valid: list[Tensor] = []
     reward = torch.zeros(env.batch_size, device=env.device)
     over = td["done"][..., 0].clone()
@@ -79,12 +79,12 @@ def rollout(
         while len(valid) != max_decisions and not over.all():  # the one wait for the device per decision
             td = actor(td)
             if keep:
-                kept.append(td.select(*keep, "action"))
+                decisions.append(td.select(*keep, "action"))
             valid.append(~over)
             td = env.step(td)["next"]
             reward += torch.where(over, 0.0, td["reward"][..., 0])
             over = over | td["done"][..., 0]
-    return Episode(torch.stack(kept) if kept else None, torch.stack(valid), reward, td)
+    return Episode(torch.stack(decisions) if decisions else None, torch.stack(valid), reward, td)
 
 
 def _as_tensordict(instances: Tensor | Problem | TensorDictBase, env: EnvBase) -> TensorDictBase:

@@ -1,7 +1,7 @@
 """JointDAN: one transformer over agents, depot and unvisited cities, beyond the paper.
 
-In DAN, agents never see the cities before they are attended to, and no city attends to another after it has seen the
-agents. Here all tokens attend to each other in every layer, so that agents and cities can negotiate, at the same cost.
+In DAN, the agents' embeddings do not depend on the cities, and cities do not attend to each other once they have
+attended to the agents. Here all tokens attend to each other in every layer, at the same cost.
 The policy stays decentralised: one agent's observation in, logits of that agent's next node out.
 
 This module knows no environment: it takes tensors and returns tensors.
@@ -48,14 +48,14 @@ class JointConfig:
 
 
 class DenseLogits(NamedTuple):
-    """The policy, and what the network expects of all agents, for dense supervision; None: it has no such output.
+    """Logits of the policy and, for dense supervision, of what all agents do. None: the network has no such output.
 
     Leading dimensions are those of the observation.
     """
 
     policy: Tensor  # (..., n) logits over the nodes: where the deciding agent goes next
     next: Tensor | None  # (..., m, n) logits over the nodes: where each agent goes next
-    assignment: Tensor | None  # (..., m, n) logits over the agents: who visits a city
+    assignment: Tensor | None  # (..., m, n) logits over the agents: which of them visits each city
 
 
 class JointDAN(nn.Module):
@@ -86,41 +86,41 @@ class JointDAN(nn.Module):
 
         Args:
             cities: (..., n, 2) float, node coordinates relative to the deciding agent; row 0 is the depot.
-            agents: (..., m, 3) float, destinations relative to it, and remaining travel times.
+            agents: (..., m, 3) float, destinations relative to the deciding agent, and remaining travel times.
             visited: (..., n) bool, the global mask M, False at the depot.
-            agent: (...) int64, the deciding agent's index: others may stand at the same place.
+            agent: (...) int64, the deciding agent's index; other agents may stand at the same place.
 
         Returns:
             (..., n) float, in [-C, C]; -C at visited nodes and out of view.
         """
         lead, n = visited.shape[:-1], visited.shape[-1]
         cities, agents, visited, agent = _rows(cities, agents, visited, agent)
-        h_agents, h_nodes, kept = self._encode(cities, agents, visited, agent)
+        h_agents, h_nodes, in_view = self._encode(cities, agents, visited, agent)
         h_decider = _gather(h_agents, agent[:, None])  # (B, 1, d)
         logits = self._next(h_decider, h_nodes)  # (B, 1, k)
-        return _scatter(logits, kept, visited, -self.config.tanh_clip).reshape(*lead, n)
+        return _scatter(logits, in_view, visited, -self.config.tanh_clip).reshape(*lead, n)
 
     def forward_dense(self, cities: Tensor, agents: Tensor, visited: Tensor, agent: Tensor) -> DenseLogits:
-        """The policy, what all agents do next, and who visits each city. The arguments are those of ``forward``.
+        """Logits of the policy, of all agents' next nodes and of each city's visitor; arguments as in ``forward``.
 
         The policy is the deciding agent's row of ``next``. At visited nodes and out of view, ``next`` is -C and
         ``assignment`` is 0.
         """
         lead, m, n = visited.shape[:-1], agents.shape[-2], visited.shape[-1]
         cities, agents, visited, agent = _rows(cities, agents, visited, agent)
-        h_agents, h_nodes, kept = self._encode(cities, agents, visited, agent)
+        h_agents, h_nodes, in_view = self._encode(cities, agents, visited, agent)
         next_logits = self._next(h_agents, h_nodes)  # (B, m, k)
         assignment = _products(self.assignment_query(h_agents), self.assignment_key(h_nodes))  # (B, m, k)
-        next_logits = _scatter(next_logits, kept, visited, -self.config.tanh_clip)  # (B, m, n)
-        assignment = _scatter(assignment, kept, visited, 0.0)  # (B, m, n)
+        next_logits = _scatter(next_logits, in_view, visited, -self.config.tanh_clip)  # (B, m, n)
+        assignment = _scatter(assignment, in_view, visited, 0.0)  # (B, m, n)
         policy = _gather(next_logits, agent[:, None])  # (B, 1, n)
         return DenseLogits(policy.reshape(*lead, n), next_logits.reshape(*lead, m, n), assignment.reshape(*lead, m, n))
 
     def _encode(self, cities: Tensor, agents: Tensor, visited: Tensor, agent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Embeddings of the agents (B, m, d) and of the nodes in view (B, k, d), and those nodes' indices (B, k)."""
         m = agents.shape[1]
-        kept, real = open_nodes(cities, visited, self.config.view, other_tokens=m)  # (B, k), the depot first
-        seen = _gather(cities, kept)  # (B, k, 2)
+        in_view, real = open_nodes(cities, visited, self.config.view, other_tokens=m)  # (B, k), the depot first
+        seen = _gather(cities, in_view)  # (B, k, 2)
         decides = torch.arange(m, device=agent.device) == agent[:, None]  # (B, m)
         h_agents = self.embed_agent(agents) + decides[:, :, None] * self.decider
         h = torch.cat([h_agents, self.embed_depot(seen[:, :1]), self.embed_city(seen[:, 1:])], dim=1)  # (B, m + k, d)
@@ -128,7 +128,7 @@ class JointDAN(nn.Module):
         for layer in self.layers:
             h = layer(h, h, mask)
         h = self.norm(h)
-        return h[:, :m], h[:, m:], kept
+        return h[:, :m], h[:, m:], in_view
 
     def _next(self, h_agents: Tensor, h_nodes: Tensor) -> Tensor:
         """(B, m, d), (B, k, d) -> (B, m, k) logits in [-C, C]."""
@@ -152,8 +152,8 @@ def _gather(h: Tensor, indices: Tensor) -> Tensor:
     return h.gather(1, indices[:, :, None].expand(-1, -1, h.shape[2]))
 
 
-def _scatter(logits: Tensor, kept: Tensor, visited: Tensor, fill: float) -> Tensor:
-    """Puts logits (B, m, k) at their nodes ``kept`` (B, k) -> (B, m, n), with ``fill`` at visited and other nodes."""
+def _scatter(logits: Tensor, in_view: Tensor, visited: Tensor, fill: float) -> Tensor:
+    """Put logits (B, m, k) at their nodes ``in_view`` (B, k) -> (B, m, n), with ``fill`` at visited and other nodes."""
     shape = (*logits.shape[:2], visited.shape[1])
-    whole = logits.new_full(shape, fill).scatter(2, kept[:, None].expand(-1, logits.shape[1], -1), logits)
+    whole = logits.new_full(shape, fill).scatter(2, in_view[:, None].expand(-1, logits.shape[1], -1), logits)
     return whole.masked_fill(visited[:, None], fill)

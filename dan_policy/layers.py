@@ -95,13 +95,13 @@ def open_nodes(
     if view is not None and longest > 1 + view:
         distance = cities.square().sum(2).masked_fill(visited, torch.inf)
         distance[:, 0] = -1.0  # the depot is always in view, and first
-        kept = distance.topk(1 + view, dim=1, largest=False).indices  # (B, k)
+        in_view = distance.topk(1 + view, dim=1, largest=False).indices  # (B, k)
     else:
         if torch.is_autocast_enabled(cities.device.type):
             longest = min(padded_length(other_tokens + longest) - other_tokens, visited.shape[1])
-        kept = torch.argsort(visited.to(torch.uint8), dim=1, stable=True)[:, :longest]  # (B, k)
-    real = is_open.gather(1, kept)
-    return kept, None if bool(real.all()) else real
+        in_view = torch.argsort(visited.to(torch.uint8), dim=1, stable=True)[:, :longest]  # (B, k)
+    real = is_open.gather(1, in_view)
+    return in_view, None if bool(real.all()) else real
 
 
 def padded_length(length: int) -> int:

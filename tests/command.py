@@ -1,4 +1,4 @@
-"""The command ``mtsp`` in tests: refused in this process, or run in one of its own."""
+"""Helpers that run the command ``mtsp``, in this process or in another one."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""What every test may ask for: a square solved by hand, and a folder with it. Pictures never open a window."""
+"""Fixtures for all tests: a square solved by hand, and a folder with its files. Pictures never open a window."""
 
 import os
 from pathlib import Path

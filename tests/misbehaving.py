@@ -105,9 +105,9 @@ def looks_around(instance, seconds, seed):
     """Report what this process may use."""
     names = [name for name in os.environ if name.endswith("_THREADS")]
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
-    seen = {
+    report = {
         "threads": {name: os.environ[name] for name in names},
         "cores": cores,
         "leads": os.getpid() == os.getpgid(0),
     }
-    raise RuntimeError(json.dumps(seen))
+    raise RuntimeError(json.dumps(report))

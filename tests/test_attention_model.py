@@ -1,4 +1,4 @@
-"""Kool et al.'s attention model: plugs in like DAN, sees one agent, does not care how cities are numbered."""
+"""Kool et al.'s attention model: used like DAN, it ignores other agents and the order of the cities."""
 
 import pytest
 import torch
@@ -30,7 +30,7 @@ def test_leading_dimensions_are_free(network, observation):
     torch.testing.assert_close(deep[1], flat)
 
 
-def test_it_ignores_other_agents_and_numbers_of_cities(network, observation):
+def test_it_ignores_other_agents_and_the_order_of_cities(network, observation):
     cities, agents, visited = observation
     logits = network(cities, agents, visited)
     torch.testing.assert_close(network(cities, agents + 1, visited), logits)

@@ -1,4 +1,4 @@
-"""Averaged weights are the mean, say where they come from, and validate as in a run."""
+"""Averaged weights are the mean, name their sources, and are validated as during a run."""
 
 from dataclasses import replace
 

@@ -52,10 +52,10 @@ def test_specs_hold_in_both_break_modes(depot, reward, device):
 def test_root_keys_are_the_documented_ones():
     env = make()
     td = env.step(env.rand_action(env.reset()))
-    seen = {"cities", "agents", "visited", "action_mask", "agent"}
-    over = {"done", "terminated", "truncated"}
-    assert set(td.keys()) == seen | over | {"game", "action", "next"}
-    assert set(td["next"].keys()) == seen | over | {"game", "reward"}
+    observed = {"cities", "agents", "visited", "action_mask", "agent"}
+    ends = {"done", "terminated", "truncated"}
+    assert set(td.keys()) == observed | ends | {"game", "action", "next"}
+    assert set(td["next"].keys()) == observed | ends | {"game", "reward"}
     assert set(td["game"].keys()) == {"nodes", *rules.STATE_FIELDS}
     assert td["next", "reward"].shape == (6, 1) and td["cities"].dtype == torch.float32
 
@@ -101,7 +101,7 @@ def test_given_instances_are_replayed_exactly():
         replay = step_mdp(env.step(replay.set("action", step["action"])))
 
 
-def test_a_game_goes_on_from_any_kept_state():
+def test_a_game_continues_from_any_saved_state():
     env = make()
     td = env.reset()
     for _ in range(4):
@@ -212,7 +212,7 @@ def test_bad_replays_are_refused():
         make().tours()
 
 
-def test_truncation_pays_the_trips_to_every_city_left():
+def test_truncation_adds_a_round_trip_to_every_unvisited_city():
     env = make(batch=4, max_decisions=2)
     _, td = play(env, env.reset())
     assert td["truncated"].all() and not td["terminated"].any()
@@ -231,7 +231,7 @@ def test_a_batch_size_may_be_a_number():
         BatchedMTSP(9, 3, [2, 3])
 
 
-def test_actions_of_any_whole_number_type_and_layout_are_taken():
+def test_actions_of_any_whole_number_type_and_layout_are_accepted():
     env = make()
     td = env.reset()
     action = random_legal_action(td["action_mask"])
@@ -244,22 +244,22 @@ def test_actions_of_any_whole_number_type_and_layout_are_taken():
             env._step(TensorDict({"action": wrong, "game": td["game"]}))
 
 
-def test_a_reset_takes_the_state_that_it_is_given_if_set_state_says_so():
+def test_a_reset_continues_from_a_given_state_only_with_set_state():
     env, other = make(seed=3), make(seed=3)
-    given = env.reset()
+    state = env.reset()
     other.reset()
-    assert torch.equal(env.reset(given, set_state=False)["game", "nodes"], other.reset()["game", "nodes"])
-    assert torch.equal(env.reset(given, set_state=True)["game", "nodes"], given["game", "nodes"])
+    assert torch.equal(env.reset(state, set_state=False)["game", "nodes"], other.reset()["game", "nodes"])
+    assert torch.equal(env.reset(state, set_state=True)["game", "nodes"], state["game", "nodes"])
     with pytest.warns(FutureWarning, match="set_state"):  # TorchRL's own default changes
-        env.reset(given)
+        env.reset(state)
 
 
 def test_a_step_changes_nothing_that_came_before():
     env = make(depot="final")
     td = env.rand_action(env.reset())
-    kept = td.clone()
+    before = td.clone()
     env.step(td)
-    assert all(torch.equal(td[key], kept[key]) for key in kept.keys(True, True))
+    assert all(torch.equal(td[key], before[key]) for key in before.keys(True, True))
 
 
 @pytest.mark.parametrize("kind", [SerialEnv, ParallelEnv])
@@ -296,7 +296,7 @@ def test_random_legal_actions_are_uniform():
     assert counts[[1, 4]].sum() == 0 and chisquare(counts[[0, 2, 3]].numpy()).pvalue > 1e-3
 
 
-# Compiled, or from one's own distribution
+# Compilation, and distributions given as functions
 
 
 @pytest.mark.slow
@@ -314,7 +314,7 @@ def test_compiled_rules_play_the_same_games(depot):
     torch.testing.assert_close(td["reward"], last["reward"])
 
 
-def test_rules_that_cannot_be_compiled_run_as_they_are(monkeypatch):
+def test_rules_that_cannot_be_compiled_run_uncompiled(monkeypatch):
     def broken(function, **options):
         def fails(*args):
             raise RuntimeError("no compiler\nin sight")
@@ -330,7 +330,7 @@ def test_rules_that_cannot_be_compiled_run_as_they_are(monkeypatch):
     assert torch.equal(td["cities"], plain.step(expected.set("action", action))["next", "cities"])
 
 
-def test_a_distribution_of_ones_own():
+def test_a_distribution_may_be_a_function():
     def on_a_line(rng, batch, n_nodes, n_agents):
         return {"nodes": np.stack([rng.random((batch, n_nodes)), np.full((batch, n_nodes), 1 / n_agents)], axis=2)}
 

@@ -33,7 +33,7 @@ def test_instances_depend_on_seed_and_size_alone():
     few, many = CELL.instances(7), Cell(8, 2, 5).instances(7)
     assert few == many[:3]
     assert not np.array_equal(few[0].nodes, CELL.instances(8)[0].nodes)
-    assert few[0].nodes[0].tolist() == [0.07684116792504614, 0.6839723787313347]  # as they have always been
+    assert few[0].nodes[0].tolist() == [0.07684116792504614, 0.6839723787313347]  # must never change
 
 
 def test_the_tables_are_the_papers():
@@ -193,7 +193,9 @@ def test_speed_is_work_over_time(monkeypatch):
 
 
 def test_solving_is_timed_and_its_memory_is_measured(monkeypatch):
-    monkeypatch.setattr(speed_solve.torch, "set_num_threads", lambda threads: None)  # this process is kept as it is
+    monkeypatch.setattr(
+        speed_solve.torch, "set_num_threads", lambda threads: None
+    )  # leave this process's threads alone
     before = speed_solve.peak_memory()
     cost = speed_solve.measure(speed_solve.Case(30, 2, "greedy"), threads=1, repeats=2)
     assert cost.first > 0 and cost.later > 0
@@ -214,21 +216,21 @@ def test_every_speed_is_measured():
 
 
 def test_the_speed_of_training_counts_what_is_done():
-    """FLOP per decision are the network's, whatever the time: a decision that is learnt from takes one forward pass and
-    a backward pass of twice the cost; REINFORCE plays it too."""
+    """FLOP per decision depend on the network alone: a decision that is learnt from takes one forward pass and
+    a backward pass of twice the cost; REINFORCE also plays it."""
     size = {"n_nodes": (6, 6), "n_agents": (2, 2), "nodes_per_agent": 1, "device": "cpu", "precision": "float32"}
     tiny = {**size, "network": DANConfig(embed_dim=16, feedforward_dim=16, n_heads=2), "validation_instances": 2}
     _, played, forward = speed_train.rollouts(tiny, 8, 0.01)
     _, learnt, both = speed_train.reinforcement(tiny, 8, 0.01)
     assert 3.5 < (both / learnt) / (forward / played) < 4.5
-    instances, shown, flops = speed_train.imitation(tiny, 16, 0.01)
-    assert instances > 0 and shown / instances == pytest.approx(6 - 1 + 2)
-    assert 2.5 < (flops / shown) / (forward / played) < 3.5
+    instances, decisions, flops = speed_train.imitation(tiny, 16, 0.01)
+    assert instances > 0 and decisions / instances == pytest.approx(6 - 1 + 2)
+    assert 2.5 < (flops / decisions) / (forward / played) < 3.5
     assert speed_train.teaching(6, 2, 0.01) > 0
 
 
 def test_peers_are_measured_in_turns_and_compared(monkeypatch, tmp_path):
-    """A peer of which every step takes 100 s is slower than we are."""
+    """A peer whose steps take 100 s each is slower than ours."""
     calls = []
 
     def measure_rl4co(python, batch, seconds):

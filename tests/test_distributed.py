@@ -30,7 +30,7 @@ def torchrun(*arguments, processes=2):
 
 
 def gradient(network, seeds):
-    """Add the gradient of the mean over five episodes per seed, with made-up advantages. Returns how many decisions."""
+    """Add the gradient of the mean over five episodes per seed (made-up advantages); return the number of decisions."""
     total = 0
     for seed in seeds:
         torch.manual_seed(seed)

@@ -26,11 +26,11 @@ FENCE = re.compile(r"^```(\S+) ?(\S*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)  #
 def fences(page: Path, language: str) -> list[tuple[str, str]]:
     """The note (what follows the language on its line) and the code of every block of one language."""
     blocks = FENCE.findall(page.read_text(encoding="utf-8"))
-    return [(note, code) for found_language, note, code in blocks if found_language == language]
+    return [(note, code) for block_language, note, code in blocks if block_language == language]
 
 
 def python_examples() -> list:
-    """Every Python block that is to be run: those that a page tells its reader to save as a file are not."""
+    """Every Python block to run; blocks that the reader is asked to save as files are left out."""
     return [
         pytest.param(page, code, id=f"{page.stem}-{number}")
         for page in PAGES
@@ -64,7 +64,7 @@ def command_lines(page: Path) -> list[list[str]]:
 
 
 def program_and_options(words: list[str]) -> tuple[tuple[str, ...], list[str]]:
-    """What names the program in a command, subcommands included, and the long options that it is given.
+    """The words that name a command's program and subcommands, and its long options.
 
     >>> program_and_options("python -m train reinforce quick --out runs/mine".split())
     (('-m', 'train', 'reinforce', 'quick'), ['--out'])

@@ -75,7 +75,7 @@ def test_canonical_tours_solve_the_same_instance_no_worse_and_in_one_order(case)
 
 @given(solved(), st.data())
 @settings(max_examples=200, deadline=None)
-def test_canonical_tours_begin_as_they_began(case, data):
+def test_canonical_tours_keep_their_prefixes(case, data):
     """Prefixes stay as they are; no agent stays at the depot while another one has two cities left."""
     instance, tours = case
     prefixes = [tour[: data.draw(st.integers(1, len(tour) - 1))] for tour in tours]
@@ -94,7 +94,7 @@ def test_canonical_tours_begin_as_they_began(case, data):
         assert waiting.index([0, 0]) == sum(tour != [0, 0] for tour in waiting)  # the idle ones come last
 
 
-def test_tours_run_counter_clockwise_and_agents_go_by_angle():
+def test_tours_run_counter_clockwise_and_agents_are_sorted_by_angle():
     """The depot in the middle of eight cities; angles begin and end in the west."""
     nodes = np.array([[0.5, 0.5], [1, 0.6], [0.6, 1], [0.4, 1], [0, 0.6], [0, 0.4], [0.4, 0], [0.6, 0], [1, 0.4]])
     tours = [[0, 2, 1, 0], [0, 4, 3, 0], [0, 8, 7, 0], [0, 6, 5, 0]]  # clockwise
@@ -108,18 +108,18 @@ def test_the_teachers_policy_plays_its_tours(case):
     instance, tours = case
     tours = canonical(instance.nodes, tours)
     first, following = (torch.as_tensor(part)[None].numpy() for part in as_links(tours, instance.n_nodes))
-    shown = Demonstrations(instance.nodes[None], first, following)
-    problem = as_problem(shown)
+    demonstrations = Demonstrations(instance.nodes[None], first, following)
+    problem = as_problem(demonstrations)
     env = environment(problem, TINY)
-    episode = rollout(follow(shown), env, "greedy", problem)
+    episode = rollout(follow(demonstrations), env, "greedy", problem)
     assert env.tours() == [tours]
     assert -float(episode.reward) == pytest.approx(makespan(instance, tours))
 
 
 def test_a_replayed_set_holds_every_decision_of_the_teachers_tours():
-    shown = demonstrate(TINY, 3)
-    decisions, valid = as_decisions(shown, KEYS, TINY)
-    batch, n_nodes = shown.nodes.shape[:2]
+    demonstrations = demonstrate(TINY, 3)
+    decisions, valid = as_decisions(demonstrations, KEYS, TINY)
+    batch, n_nodes = demonstrations.nodes.shape[:2]
     assert decisions.shape == valid.shape and valid.shape[1] == batch
     for b in range(batch):
         chosen = decisions["action"][:, b][valid[:, b]]
@@ -132,21 +132,23 @@ def test_sets_depend_on_their_index_alone_and_the_teacher_is_near_optimal():
     assert all(np.array_equal(a, b) for a, b in zip(one, again, strict=True))
     assert one.nodes.shape != other.nodes.shape or not np.array_equal(one.nodes, other.nodes)
     config = replace(TINY, n_nodes=(9, 9), n_agents=(2, 2), teacher_iterations=200)
-    shown = demonstrate(config, 0)
-    taught = [float(part) for part in teacher_costs(shown, config)]
+    demonstrations = demonstrate(config, 0)
+    teacher_makespans = [float(part) for part in teacher_costs(demonstrations, config)]
     from mtsp_env.reference import improve
 
-    best = [makespan(one, improve(one, iterations=5000)) for one in (Instance(nodes, 2) for nodes in shown.nodes)]
-    assert np.mean(taught) <= 1.002 * np.mean(best)  # tidy tours may give away a little of the makespan
+    best = [
+        makespan(one, improve(one, iterations=5000)) for one in (Instance(nodes, 2) for nodes in demonstrations.nodes)
+    ]
+    assert np.mean(teacher_makespans) <= 1.002 * np.mean(best)  # tidy tours may give away a little of the makespan
 
 
-def as_problem(shown):
-    return Problem(shown.first.shape[1], {"nodes": torch.tensor(shown.nodes)})
+def as_problem(demonstrations):
+    return Problem(demonstrations.first.shape[1], {"nodes": torch.tensor(demonstrations.nodes)})
 
 
-def teacher_costs(shown, config):
-    problem = as_problem(shown)
-    return -rollout(follow(shown), environment(problem, config), "greedy", problem).reward
+def teacher_costs(demonstrations, config):
+    problem = as_problem(demonstrations)
+    return -rollout(follow(demonstrations), environment(problem, config), "greedy", problem).reward
 
 
 @pytest.fixture
@@ -157,26 +159,26 @@ def student(tmp_path):
     return replace(TINY, roll_in=str(tmp_path / "student.safetensors"))
 
 
-def test_the_student_plays_the_beginning_and_the_teacher_goes_on(student):
-    begun = set()
+def test_the_student_plays_the_beginning_and_the_teacher_continues(student):
+    begins = set()
     for index in range(12):
-        shown = demonstrate(student, index)
-        decisions, valid = as_decisions(shown, KEYS, student)
-        assert 0 <= shown.begin < shown.nodes.shape[1] - 1 and valid[: shown.begin].all()
+        demonstrations = demonstrate(student, index)
+        decisions, valid = as_decisions(demonstrations, KEYS, student)
+        assert 0 <= demonstrations.begin < demonstrations.nodes.shape[1] - 1 and valid[: demonstrations.begin].all()
         logits = load(student.roll_in)(decisions["cities"], decisions["agents"], decisions["visited"])
         likeliest = logits.masked_fill(~decisions["action_mask"], -torch.inf).argmax(-1)
         same_choice = (likeliest == decisions["action"]) | ~valid
-        assert same_choice[: shown.begin].all()
-        assert not same_choice[shown.begin :].all()
-        begun.add(shown.begin)
-        played = -play(load(student.roll_in), as_problem(shown), student, "greedy").reward
+        assert same_choice[: demonstrations.begin].all()
+        assert not same_choice[demonstrations.begin :].all()
+        begins.add(demonstrations.begin)
+        played = -play(load(student.roll_in), as_problem(demonstrations), student, "greedy").reward
         assert (
-            teacher_costs(shown, student) <= 1.01 * played
+            teacher_costs(demonstrations, student) <= 1.01 * played
         ).all()  # the teacher continues near-optimally; tidy tours may give away a little
-    assert len(begun) > 3
+    assert len(begins) > 3
 
 
-def test_what_comes_after_the_students_part_is_learnt_from(student):
+def test_decisions_after_the_students_part_are_learnt_from(student):
     for passes in (1.0, 0.25):
         buffer = Buffer(replace(student, passes=passes, sets_per_step=1, buffer=1), KEYS, np.random.default_rng(0))
         for index in range(6):
@@ -240,7 +242,7 @@ def test_resume_is_bit_identical(tmp_path, monkeypatch, student):
     assert whole["progress"]["best"] == parts["progress"]["best"]
 
 
-def test_a_run_does_not_go_on_with_another_student(tmp_path, student):
+def test_a_run_cannot_be_resumed_with_another_student(tmp_path, student):
     run = replace(student, out=tmp_path / "run", steps=2)
     imitate(run)
     torch.manual_seed(4)

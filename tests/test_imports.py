@@ -56,23 +56,23 @@ LIGHT = [
 
 def imports(file: Path, package: str) -> list[tuple[str, bool]]:
     """Every module that a file imports, with its full name, and whether the file's own import runs it."""
-    found: list[tuple[str, bool]] = []
+    imported: list[tuple[str, bool]] = []
 
     def visit(node: ast.AST, at_import: bool) -> None:
         if isinstance(node, ast.Import):
-            found.extend((alias.name, at_import) for alias in node.names)
+            imported.extend((alias.name, at_import) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             above = package.split(".")[: len(package.split(".")) + 1 - node.level] if node.level else []
             module = ".".join([*above, *([node.module] if node.module else [])])
-            found.append((module, at_import))
-            found.extend((f"{module}.{alias.name}", at_import) for alias in node.names)
+            imported.append((module, at_import))
+            imported.extend((f"{module}.{alias.name}", at_import) for alias in node.names)
         later = isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
         typing_only = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
         for child in ast.iter_child_nodes(node):
             visit(child, at_import and not later and not typing_only)
 
     visit(ast.parse(file.read_text(encoding="utf-8")), True)
-    return found
+    return imported
 
 
 def imports_of(file: str) -> list[tuple[str, bool]]:
@@ -113,7 +113,7 @@ def cycles(graph: dict[str, set[str]]) -> list[list[str]]:
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_modules_do_not_import_each_other_in_circles(package: str) -> None:
-    """Imports within functions and for type checkers count too."""
+    """Imports within functions and for type checkers also count."""
     names = {file: file.removesuffix(".py").removesuffix("/__init__").replace("/", ".") for file in FILES}
     files = [file for file in FILES if file.partition("/")[0] == package and not file.endswith("__init__.py")]
     modules = {names[file] for file in files}
@@ -127,7 +127,7 @@ def test_cycles_are_recognised() -> None:
 
 
 @pytest.mark.parametrize("file", FORBIDDEN)
-def test_files_keep_apart(file: str) -> None:
+def test_files_import_nothing_forbidden(file: str) -> None:
     if not (ROOT / file).exists():
         pytest.skip("not written yet")
     names = {name for name, _ in imports_of(file)}
@@ -141,7 +141,7 @@ def test_light_modules_import_no_extra_at_import(module: str) -> None:
 
 
 def test_the_environment_imports_light() -> None:
-    """Nor does what it imports import anything heavy; importing does not touch the global random state either."""
+    """Importing it loads no heavy package, not even indirectly, and keeps NumPy's global random state."""
     code = f"""
 import sys, numpy
 numpy.random.seed(3)
@@ -156,7 +156,7 @@ assert not heavy, heavy
 
 
 @pytest.mark.parametrize(
-    ("code", "found"),
+    ("code", "expected"),
     [
         ("import torch.nn as nn", [("torch.nn", True)]),
         ("from mtsp_env import rules", [("mtsp_env", True), ("mtsp_env.rules", True)]),
@@ -168,8 +168,8 @@ assert not heavy, heavy
         ("class A:\n import torch", [("torch", True)]),
     ],
 )
-def test_imports_are_found(tmp_path: Path, code: str, found: list[tuple[str, bool]]) -> None:
-    """Of the check itself: what it sees in a file of the package mtsp_env."""
+def test_imports_are_found(tmp_path: Path, code: str, expected: list[tuple[str, bool]]) -> None:
+    """The check itself, on a file of the package ``mtsp_env``."""
     file = tmp_path / "module.py"
     file.write_text(code, encoding="utf-8")
-    assert imports(file, "mtsp_env") == found
+    assert imports(file, "mtsp_env") == expected

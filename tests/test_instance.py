@@ -40,7 +40,7 @@ instances = st.builds(
 )
 
 
-# What an instance is
+# Validation and equality
 
 
 @pytest.mark.parametrize(
@@ -219,7 +219,7 @@ def test_instance_file_round_trip(tmp_path_factory, instance: Instance, n_agents
     assert read_instance(path, n_agents) == Instance(instance.nodes, m, instance.name, instance.scale)
 
 
-def test_numbers_of_numpy_can_be_written(tmp_path) -> None:
+def test_numpy_scalars_can_be_written(tmp_path) -> None:
     instance = Instance(PAIR, np.int32(2), "pair", np.float32(2.5))
     write_instance(tmp_path / "a.json", instance)
     assert read_instance(tmp_path / "a.json") == instance
@@ -274,7 +274,7 @@ def test_damaged_tours_file_is_refused_by_name(tmp_path, content: str) -> None:
 
 
 @pytest.mark.parametrize("read", [read_instance, read_tours])
-def test_no_such_file(tmp_path, read) -> None:
+def test_a_missing_file_is_named(tmp_path, read) -> None:
     with pytest.raises(OSError, match="nowhere"):
         read(tmp_path / "nowhere.json")
 
@@ -333,9 +333,9 @@ def test_worlds_are_compared_hashed_pickled_written_and_batched(field: str, tmp_
     assert problem.arrays[field].shape == (2, *value.shape) and problem.instance(1) == world
     with pytest.raises(ValueError, match="instance 1 has"):
         batch([world, plain])
-    for judge in (lambda: rules.start(problem), lambda: makespan(world, [[0, 1, 2, 3, 0], [0, 0]])):
+    for use in (lambda: rules.start(problem), lambda: makespan(world, [[0, 1, 2, 3, 0], [0, 0]])):
         with pytest.raises(ValueError, match=rf"only plain problems .* world fields \['{field}'\]"):
-            judge()
+            use()
 
 
 @pytest.mark.parametrize(

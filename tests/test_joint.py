@@ -25,7 +25,7 @@ def small():
 
 
 def observation(batch=5, n=9, m=4, seed=0, dtype=torch.float32):
-    """Cities, agents, visited and agent. Two agents stand at the decider's place, so that only its index tells it."""
+    """Cities, agents, visited and agent. Two agents stand at one place, so only the index identifies the decider."""
     generator = torch.Generator().manual_seed(seed)
     cities = torch.rand(batch, n, 2, generator=generator, dtype=torch.float64) * 2 - 1
     agents = torch.rand(batch, m, 3, generator=generator, dtype=torch.float64)

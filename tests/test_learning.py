@@ -1,4 +1,4 @@
-"""Ablations and learning curves, on sizes that learn nothing in seconds: what is trained, judged, kept and resumed."""
+"""Ablations and learning curves, on tiny sizes and for seconds: what is trained, evaluated, saved and resumed."""
 
 import csv
 import json
@@ -58,21 +58,21 @@ def test_gaps_are_to_the_best_known_tours():
 )
 @pytest.mark.slow
 def test_a_variant_is_trained_in_its_stages(small, tmp_path, variant, stages):
-    found = ablations.train_and_evaluate(variant, 1.0, 0, tmp_path)
-    assert (found["imitation_steps"] > 0, found["reinforce_steps"] > 0) == stages
-    assert len(found["gaps"]["50x5"]["greedy"]) == len(found["gaps"]["50x5"]["sample"]) == 3
-    assert found["seconds"] > 0
+    result = ablations.train_and_evaluate(variant, 1.0, 0, tmp_path)
+    assert (result["imitation_steps"] > 0, result["reinforce_steps"] > 0) == stages
+    assert len(result["gaps"]["50x5"]["greedy"]) == len(result["gaps"]["50x5"]["sample"]) == 3
+    assert result["seconds"] > 0
     weights = {"both": 825_088, "taught": 1_022_848, "alone": 1_022_848, "other": 710_272}
-    assert found["weights"] == weights[variant.name]
+    assert result["weights"] == weights[variant.name]
 
 
-def test_verdicts_are_kept_and_not_mixed(tmp_path, monkeypatch, capsys):
+def test_saved_results_are_reused_by_the_same_run_only(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(ablations, "VARIANTS", ablations.VARIANTS[:2])
     gaps = {cell.label: {"greedy": [0.1, 0.3], "sample": [0.01, 0.03]} for cell in ablations.CELLS}
     for number, variant in enumerate(ablations.VARIANTS):
-        told = {"minutes": 2.0, "seed": 0, "name": variant.name, "imitation_steps": 1234 * number}
-        found = {"reinforce_steps": 7, "seconds": 120.0, "weights": 1000, "gaps": gaps}
-        (tmp_path / f"{number}.json").write_text(json.dumps(told | found))
+        options = {"minutes": 2.0, "seed": 0, "name": variant.name, "imitation_steps": 1234 * number}
+        outcome = {"reinforce_steps": 7, "seconds": 120.0, "weights": 1000, "gaps": gaps}
+        (tmp_path / f"{number}.json").write_text(json.dumps(options | outcome))
     ablations.main(2.0, tmp_path, 0, tmp_path / "out" / "table.md")
     table = (tmp_path / "out" / "table.md").read_text()
     both = "| 20.0 ± 10.0 | 2.0 ± 1.0 "
@@ -84,11 +84,11 @@ def test_verdicts_are_kept_and_not_mixed(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_curves_go_on_until_their_time_is_over(small, tmp_path, monkeypatch, capsys):
+def test_curves_are_trained_until_their_time_is_over(small, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(curves, "QUICK", replace(QUICK, batch_size=4, challenge_instances=4))
-    taught, reinforced = curves.imitate, curves.reinforce
-    monkeypatch.setattr(curves, "reinforce", lambda config: reinforced(replace(config, validate_every=1)))
-    monkeypatch.setattr(curves, "imitate", lambda config: taught(replace(config, validate_every=1, set_tokens=64)))
+    imitate, reinforce = curves.imitate, curves.reinforce
+    monkeypatch.setattr(curves, "reinforce", lambda config: reinforce(replace(config, validate_every=1)))
+    monkeypatch.setattr(curves, "imitate", lambda config: imitate(replace(config, validate_every=1, set_tokens=64)))
     curves.main(0.02, tmp_path / "runs", tmp_path)
     with (tmp_path / "curves.csv").open() as file:
         rows = list(csv.DictReader(file))

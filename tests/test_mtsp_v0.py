@@ -37,7 +37,8 @@ on_grid = pytest.mark.parametrize(
     "settings", GRID, ids=lambda s: "-".join(map(str, (s["n_nodes"], s["n_agents"], s["speed"], s["depot"])))
 )
 
-# api_test says this of any environment that is not on its own list and observes a Dict, as its own chess and go do.
+# api_test warns of these if observations are a Dict, as in PettingZoo's chess and go, and the environment is not on its
+# own list.
 DICT_WARNINGS = {
     "Observation is not a NumPy array",
     "Observation space for each agent probably should be gymnasium.spaces.box or gymnasium.spaces.discrete",
@@ -45,7 +46,7 @@ DICT_WARNINGS = {
 
 
 def same(one: object, other: object) -> bool:
-    """Equal, arrays inside to the last bit and dtype."""
+    """Whether two values are equal; arrays within them must be equal bit for bit and have the same dtype."""
     if isinstance(one, np.ndarray):
         return one.dtype == other.dtype and np.array_equal(one, other)
     if isinstance(one, dict):
@@ -98,7 +99,7 @@ def test_pettingzoo_render(monkeypatch: pytest.MonkeyPatch) -> None:
     render_test(lambda render_mode: mtsp_v0.env(n_nodes=8, n_agents=2, render_mode=render_mode))
 
 
-def test_pettingzoo_makes_it() -> None:
+def test_pettingzoo_make_creates_the_environment() -> None:
     assert pettingzoo.make("aec", "mtsp/mtsp-v0", n_nodes=7, n_agents=2).unwrapped.n_nodes == 7
 
 
@@ -107,15 +108,15 @@ def test_pettingzoo_makes_it() -> None:
 
 @on_grid
 def test_a_seed_fixes_all_episodes_after_it(settings: dict) -> None:
-    env, stories = mtsp_v0.env(**settings), []
+    env, traces = mtsp_v0.env(**settings), []
     for _ in range(2):
         episodes = []
         for seed in (7, None, None):
             env.reset(seed=seed)
             episodes.append(play(env))
-        stories.append(episodes)
+        traces.append(episodes)
         assert not any(same(*pair) for pair in combinations(episodes, 2))  # each has an instance of its own
-    assert same(*stories)
+    assert same(*traces)
 
 
 @on_grid
@@ -124,10 +125,10 @@ def test_pickles_and_copies_play_the_same(settings: dict) -> None:
         env = make(**settings)
         twins = [pickle.loads(pickle.dumps(env)), copy.deepcopy(env)]
         env.reset(seed=3)
-        story = play(env)
+        trace = play(env)
         for twin in twins:
             twin.reset(seed=3)
-            assert same(play(twin), story)
+            assert same(play(twin), trace)
             assert same(twin.infos, env.infos)
 
 
@@ -135,9 +136,9 @@ def test_a_given_instance_is_played() -> None:
     env, instance = mtsp_v0.env(n_nodes=9, n_agents=3), uniform(np.random.default_rng(5), 9, 3)
     env.reset(seed=1, options={"instance": instance})
     assert env.unwrapped.instance is instance
-    story = play(env, seed=2)
+    trace = play(env, seed=2)
     env.reset(seed=8, options={"instance": instance})
-    assert same(play(env, seed=2), story)
+    assert same(play(env, seed=2), trace)
     check_tours(instance, env.unwrapped.tours)
     env.reset(seed=8)
     assert env.unwrapped.instance != instance
@@ -162,7 +163,7 @@ def test_an_instance_of_another_size_is_refused(size: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize("instance", [{"nodes": 3}, "berlin52", np.zeros((9, 2))], ids=["dict", "str", "array"])
-def test_what_is_no_instance_is_refused(instance: object) -> None:
+def test_other_types_than_instance_are_refused(instance: object) -> None:
     with pytest.raises(ValueError, match="Instance"):
         mtsp_v0.raw_env(n_nodes=9, n_agents=3).reset(options={"instance": instance})
 
@@ -243,7 +244,7 @@ def test_an_illegal_action_changes_nothing() -> None:
         env.step(random_action(env, rng))
 
 
-def test_actions_are_checked_unobserved_too() -> None:
+def test_actions_are_checked_without_an_observation() -> None:
     env = mtsp_v0.raw_env(n_nodes=5, n_agents=1)
     for _ in range(2):
         env.reset(seed=0)
@@ -298,49 +299,49 @@ def test_torchrl_wraps_it(depot: str, reward: str, max_decisions: int | None) ->
         warnings.filterwarnings("ignore", "PettingZoo in TorchRL is tested using version")
         wrapped = PettingZooWrapper(mtsp_v0.env(**kwargs), use_mask=True, group_map=MarlGroupMapType.ALL_IN_ONE_GROUP)
     raw, group, rng = mtsp_v0.raw_env(**kwargs), "agents", np.random.default_rng(0)
-    now = wrapped.reset()
+    td = wrapped.reset()
     raw.reset(options={"instance": Instance(wrapped._env.unwrapped.instance.nodes, 3)})
     while not over(raw):
         acting = raw.possible_agents.index(raw.agent_selection)
-        check_torchrl_observation(now[group], raw, acting)
+        check_torchrl_observation(td[group], raw, acting)
         action = random_action(raw, rng)
         raw.step(action)
-        now[group, "action"] = torch.full((3,), action)
-        now = wrapped.step(now)["next"]
-        assert now[group, "reward"].tolist() == [[np.float32(raw.rewards[a])] for a in raw.possible_agents]
-        assert now["done"].item() == over(raw)
-        assert now["terminated"].item() == all(raw.terminations.values())
-        assert now["truncated"].item() == all(raw.truncations.values())
-    check_torchrl_observation(now[group], raw, None)
+        td[group, "action"] = torch.full((3,), action)
+        td = wrapped.step(td)["next"]
+        assert td[group, "reward"].tolist() == [[np.float32(raw.rewards[a])] for a in raw.possible_agents]
+        assert td["done"].item() == over(raw)
+        assert td["terminated"].item() == all(raw.terminations.values())
+        assert td["truncated"].item() == all(raw.truncations.values())
+    check_torchrl_observation(td[group], raw, None)
 
 
-def check_torchrl_observation(now: object, raw: mtsp_v0.raw_env, acting: int | None) -> None:
+def check_torchrl_observation(td: object, raw: mtsp_v0.raw_env, acting: int | None) -> None:
     for i, agent in enumerate(raw.possible_agents):
         seen = raw.observe(agent)
         for key, value in seen["observation"].items():
             value = (
                 np.eye(len(raw.possible_agents), dtype=int)[value] if key == "agent" else value
             )  # one-hot in TorchRL
-            assert np.array_equal(now["observation", "observation", key][i].numpy(), value)
+            assert np.array_equal(td["observation", "observation", key][i].numpy(), value)
         if acting is not None:
-            assert bool(now["mask"][i]) == (i == acting)
+            assert bool(td["mask"][i]) == (i == acting)
         if i == acting:
-            assert now["action_mask"][i].tolist() == seen["action_mask"].astype(bool).tolist()
+            assert td["action_mask"][i].tolist() == seen["action_mask"].astype(bool).tolist()
 
 
 # Copies
 
 
-def story_of(env: pettingzoo.AECEnv) -> list[tuple]:
-    """What is seen and paid until the end of the episode and in the next reset, under actions that depend on that."""
-    story = []
+def trace_of(env: pettingzoo.AECEnv) -> list[tuple]:
+    """All observations and rewards until the episode ends, and the next instance; actions depend on observations."""
+    trace = []
     while not over(env):
         agent, seen = env.agent_selection, env.observe(env.agent_selection)
         legal = np.flatnonzero(seen["action_mask"])
         env.step(int(legal[7 * len(legal) // 10]))
-        story.append((agent, seen, dict(env.rewards), env.unwrapped.tours, dict(env.infos)))
+        trace.append((agent, seen, dict(env.rewards), env.unwrapped.tours, dict(env.infos)))
     env.reset()
-    return [*story, env.unwrapped.instance]
+    return [*trace, env.unwrapped.instance]
 
 
 @pytest.mark.parametrize(
@@ -348,18 +349,18 @@ def story_of(env: pettingzoo.AECEnv) -> list[tuple]:
 )
 @pytest.mark.parametrize("make", [mtsp_v0.env, mtsp_v0.raw_env])
 @pytest.mark.parametrize("reward", ["sparse", "shaped"])
-def test_a_copy_of_a_running_game_goes_on_as_the_game_does(make: Callable, copy_of: Callable, reward: str) -> None:
+def test_a_copy_of_a_running_game_continues_as_the_game_does(make: Callable, copy_of: Callable, reward: str) -> None:
     env = make(n_nodes=8, n_agents=3, reward=reward)
     env.reset(seed=3)
-    story, copies = story_of(copy_of(env)), []
-    for agent, seen, *_ in story[:-1]:
+    trace, copies = trace_of(copy_of(env)), []
+    for agent, seen, *_ in trace[:-1]:
         copies.append(copy_of(env))
         assert env.agent_selection == agent and same(env.observe(agent), seen)
         legal = np.flatnonzero(seen["action_mask"])
         env.step(int(legal[7 * len(legal) // 10]))
     assert over(env) and len(copies) >= 7
     for passed, twin in enumerate(copies):
-        assert same(story_of(twin), story[passed:])  # no copy has changed another
+        assert same(trace_of(twin), trace[passed:])  # no copy has changed another
 
 
 def test_agents_are_counted_before_the_first_reset() -> None:
@@ -377,7 +378,7 @@ def test_tours_are_in_the_infos_on_request() -> None:
         assert set(info) == {"makespan", "tours"} if info_tours else {"makespan"}
 
 
-def test_a_distribution_of_ones_own() -> None:
+def test_a_distribution_may_be_a_function() -> None:
     def square(rng: np.random.Generator, batch: int, n_nodes: int, n_agents: int) -> dict:
         return {"nodes": np.tile([[0.0, 0.0], [0.0, 1.0], [1.0, 1.0], [1.0, 0.0]], (batch, 1, 1))}
 

@@ -1,4 +1,4 @@
-"""A network of one's own, in a file outside the checkout, is trained, validated, saved and used like the shipped ones.
+"""A network from a file outside the checkout is trained, validated, saved and used like the shipped ones.
 
 The file is the one that docs/own-network.md tells its reader to save; the slow test runs the page's own commands.
 """
@@ -38,7 +38,7 @@ def folder(tmp_path, monkeypatch) -> Path:
 
 
 def run(line: str) -> str:
-    """Run a command in the working directory with the checkout on the path; what it printed."""
+    """Run a command in the working directory with the checkout on the path; returns what it printed."""
     program, *arguments = shlex.split(line)
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "100"}
     done = subprocess.run([*PROGRAMS[program], *arguments], env=environment, capture_output=True, text=True)
@@ -99,7 +99,7 @@ def test_leading_dimensions_are_free_and_the_actor_reads_its_keys(folder):
     flat = network(*observation)
     deep = network(*(part.unflatten(0, (2, 3)) for part in observation))
     torch.testing.assert_close(deep.flatten(0, 1), flat)
-    assert not torch.allclose(network(*observation[:3], (observation[3] + 1) % 3), flat)  # it knows who decides
+    assert not torch.allclose(network(*observation[:3], (observation[3] + 1) % 3), flat)  # the deciding agent matters
 
 
 @pytest.mark.slow

@@ -81,9 +81,9 @@ def test_plans_label_waiting_travelling_and_closed_agents(decisions):
 def test_every_label_of_a_set_fits_its_decision():
     """The deciding agent's label is its action; next nodes are unvisited; a city's visitor visits it."""
     for index in range(4):
-        shown = demonstrate(TINY, index)
-        decisions, valid = as_decisions(shown, KEYS, TINY)
-        decisions = add_plans(decisions, shown)
+        demonstrations = demonstrate(TINY, index)
+        decisions, valid = as_decisions(demonstrations, KEYS, TINY)
+        decisions = add_plans(decisions, demonstrations)
         one = decisions[valid]
         closed, following = one["plan", "closed"], one["plan", "next"]
         assert torch.equal(following.gather(1, one["agent"][:, None])[:, 0], one["action"])
@@ -91,7 +91,7 @@ def test_every_label_of_a_set_fits_its_decision():
         assert not one["visited"].gather(1, following)[~closed].any()
         for t, b in valid.nonzero().tolist():
             if (city := int(decisions["action"][t, b])) != 0:
-                assert visitors(shown)[b, city] == decisions["agent"][t, b]
+                assert visitors(demonstrations)[b, city] == decisions["agent"][t, b]
 
 
 def test_losses_of_uniform_logits_count_what_is_open(decisions):
@@ -108,14 +108,14 @@ def test_losses_vanish_for_the_teachers_plan_and_ignore_closed_agents(decisions)
     following = 50.0 * torch.nn.functional.one_hot(plan["next"], 6)
     assignment = 50.0 * torch.nn.functional.one_hot(plan["visitor"], 3).transpose(1, 2)
     closed = plan["closed"][:, :, None]
-    for noise in (0.0, 100.0):  # what the network says of closed agents
+    for noise in (0.0, 100.0):  # added to the logits of closed agents
         logits = DenseLogits(following[:, 0], following + noise * closed, assignment + noise * closed)
         assert max(map(float, plan_losses(logits, decisions))) < 1e-6
     wrong = DenseLogits(following[:, 0], following.flip(2), assignment.flip(1))
     assert min(map(float, plan_losses(wrong, decisions))) > 1.0
 
 
-def test_a_network_may_have_one_of_the_outputs(decisions):
+def test_a_network_may_have_only_one_of_the_outputs(decisions):
     logits = torch.zeros(6, 3, 6)
     next_loss, assignment_loss = plan_losses(DenseLogits(logits[:, 0], None, logits), decisions)
     assert float(next_loss) == 0.0 and float(assignment_loss) > 0.0

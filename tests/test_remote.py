@@ -56,7 +56,7 @@ def test_actions_alone_restore_an_episode(network, depot):
 
 
 @pytest.mark.slow
-def test_workers_play_their_parts_with_the_weights_of_the_moment(network, cluster):
+def test_workers_play_their_parts_with_the_current_weights(network, cluster):
     config = replace(CONFIG, samples=2, baseline="shared", curriculum=((5, 10, 12, 3, 3),))
     workers = RayWorkers(network, config, first_step=3)
     sizes = []
@@ -93,7 +93,7 @@ def test_more_workers_than_cpus_are_refused(network, cluster):
         RayWorkers(network, replace(CONFIG, ray_workers=3), first_step=0)
 
 
-def test_no_ray_names_the_extra(network, monkeypatch):
+def test_without_ray_the_error_names_the_extra(network, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ModuleNotFoundError, match=r"mtsp-env\[ray\]"):
         RayWorkers(network, CONFIG, first_step=0)

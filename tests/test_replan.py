@@ -1,4 +1,4 @@
-"""A team under way is replanned from where it is: the plan goes on as if it had never been interrupted."""
+"""A team that is under way is replanned from its current state, as if the plan had never been interrupted."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def test_prefixes_lead_to_the_moment_at_which_they_were_taken(seed: int, n_nodes
 
 
 def test_games_side_by_side_begin_at_the_same_moment() -> None:
-    """In the square's symmetries, too, in which every length stays what it is."""
+    """Also in the symmetries of the square, which preserve every length."""
     instance = uniform(np.random.default_rng(1), 9, 3)
     game = rules.make_rules(9, 3, SPEED, "final", "sparse", None)
     prefixes = [[0, 4, 2], [0], [0, 1]]
@@ -57,8 +57,8 @@ def test_games_side_by_side_begin_at_the_same_moment() -> None:
 
 
 @pytest.mark.parametrize("policy", ["default", nearest], ids=["DAN", "nearest"])
-def test_a_plan_goes_on_as_it_would_have(policy) -> None:
-    """Greedy play does not look back, so the rest of a plan is planned again in the same way, from any moment."""
+def test_replanning_continues_the_same_plan(policy) -> None:
+    """Greedy decisions depend on the current state alone, so replanning from any moment gives the same plan."""
     instance = uniform(np.random.default_rng(5), 20, 3)
     plan = solve(instance, policy)
     played = np.concatenate([np.array(tour[1:-1]) for tour in plan.tours])
@@ -72,7 +72,7 @@ def test_a_plan_goes_on_as_it_would_have(policy) -> None:
 
 
 @pytest.mark.parametrize("options", [{"augment": True}, {"decode": "sample", "samples": 5}, {"improve": 0.02}])
-def test_all_kinds_of_plans_keep_the_beginning(options: dict) -> None:
+def test_all_kinds_of_plans_keep_the_prefixes(options: dict) -> None:
     if "improve" in options:
         pytest.importorskip("numba", reason="needs the extra reference")
     instance = uniform(np.random.default_rng(6), 30, 4)

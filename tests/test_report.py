@@ -1,4 +1,4 @@
-"""Reports agree with their rows: statistics by hand, every damage and every failure named."""
+"""Reports agree with their rows: statistics by hand; every damaged line and every failure is named."""
 
 import gzip
 import json
@@ -87,9 +87,9 @@ def test_gaps_are_to_the_best_of_the_rows_and_the_kept_tours(tmp_path):
     (alone,) = statistics.load(files[:1])
     assert list(alone.gaps("one", "8x2").values()) == [0, 0, 0]
 
-    kept = tmp_path / "kept"
-    best_known.merge(suite.cells("smoke")[0], 7, {1: HALVES}, kept)
-    (results,) = statistics.load(files[:1], None, kept)
+    folder = tmp_path / "kept"
+    best_known.merge(suite.cells("smoke")[0], 7, {1: HALVES}, folder)
+    (results,) = statistics.load(files[:1], None, folder)
     assert list(results.gaps("one", "8x2").values()) == pytest.approx([0, COSTS["one"][1] / COSTS["halves"][1] - 1, 0])
     assert (results.unkept, alone.unkept) == (2, 3)
 
@@ -110,8 +110,8 @@ def test_a_report_by_hand(tmp_path):
     assert wins == 3  # so p is 2 of 8
     assert line_of(text, "Against dan-s64", "reference 0.5 s") == ["3/0/0, p = 0.25"] * 2 + ["1 of 1 cells"]
     assert "**dan-s64 loses to** reference 0.5 s; it beats none." in text
-    apart = 100 * (1 - 1 / costs[1])
-    assert line_of(text, "Proved", "reference 0.5 s")[0].startswith(f"0 of 3, {apart.mean():.2f} ± ")
+    bound_gaps = 100 * (1 - 1 / costs[1])
+    assert line_of(text, "Proved", "reference 0.5 s")[0].startswith(f"0 of 3, {bound_gaps.mean():.2f} ± ")
     assert "8, 2 (3)" in text and "6 rows, test set seed 7" in text
     assert "Against" not in report([tmp_path / "rows.jsonl"], against="lkh3")
 

@@ -26,11 +26,11 @@ def test_every_decision_is_algorithm_1s(face: str, seeds: range) -> None:
 
 @st.composite
 def odd_games(draw: st.DrawFn) -> Game:
-    """Small games on few coordinates: ties, coincident nodes, legs of whole ticks, of less than one, of near none."""
+    """Small games on few coordinates: ties, coincident nodes, legs of whole ticks, below a tick, and almost 0 long."""
     axis = st.sampled_from([0.0, 0.1, 0.2, 0.25, 0.3, 0.3 + 1e-12, 0.5, 0.6, 0.7, 0.8, 1.0])
     n, m = draw(st.integers(2, 7)), draw(st.integers(1, 5))
     nodes = draw(st.lists(st.tuples(axis, axis), min_size=n, max_size=n))
-    how = rules.make_rules(
+    game_rules = rules.make_rules(
         n,
         m,
         speed=draw(st.sampled_from([0.1, 0.01, 0.05, 0.3, 1.0, 7.0])),
@@ -38,7 +38,7 @@ def odd_games(draw: st.DrawFn) -> Game:
         reward=draw(st.sampled_from(rules.REWARDS)),
         max_decisions=draw(st.none() | st.integers(1, n + m)),
     )
-    return Game(np.array([nodes]), m, how, (draw(st.sampled_from(PLAYERS)),), draw(st.integers(0, 2**16)))
+    return Game(np.array([nodes]), m, game_rules, (draw(st.sampled_from(PLAYERS)),), draw(st.integers(0, 2**16)))
 
 
 @settings(max_examples=250, deadline=None, derandomize=True, database=None)
@@ -98,11 +98,11 @@ def test_shaped_rewards_sum_to_the_sparse_one(seed: int) -> None:
     game, states = walk(seed)
     total = {}
     for kind in rules.REWARDS:
-        how = rules.Rules(game.rules.speed, game.rules.depot, kind, game.rules.max_decisions)
+        game_rules = rules.Rules(game.rules.speed, game.rules.depot, kind, game.rules.max_decisions)
         over = np.array(
-            [rules.all_visited(state) | rules.truncated(state, how) for state in states]
+            [rules.all_visited(state) | rules.truncated(state, game_rules) for state in states]
         )  # (decisions + 1, B)
-        paid = np.array([rules.reward(*pair, how) for pair in pairwise(states)])  # (decisions, B)
+        paid = np.array([rules.reward(*pair, game_rules) for pair in pairwise(states)])  # (decisions, B)
         assert kind == "shaped" or not paid[~over[1:]].any()  # sparse: nothing before the end
         total[kind] = np.where(over[:-1], 0.0, paid).sum(axis=0)
     np.testing.assert_allclose(total["shaped"], total["sparse"], atol=1e-9)
@@ -136,13 +136,13 @@ def _kind(array: rules.Array) -> str:
 def test_finished_games_stand_still(seed: int) -> None:
     """A batch steps its finished rows along with the others: to the depot, which changes neither cost nor tours."""
     game, states = walk(seed)
-    how = game.rules
+    game_rules = game.rules
     for before, after in pairwise(states):
         over = rules.all_visited(before)
         assert (rules.all_visited(after) | ~over).all()
         assert rules.makespan(after)[over] == pytest.approx(rules.makespan(before)[over], abs=1e-12)
         assert (
-            rules.legal_actions(before, how, rules.agent_to_decide(before))[over].sum() == over.sum()
+            rules.legal_actions(before, game_rules, rules.agent_to_decide(before))[over].sum() == over.sum()
         )  # the depot alone
         for row in np.flatnonzero(over):
             assert rules.tours(after.visits[row], after.destination[row]) == rules.tours(
@@ -160,14 +160,14 @@ def test_depart_changes_nothing_in_place() -> None:
 @pytest.mark.parametrize("size", [(2, 1), (2, 5), (9, 3), (30, 1), (25, 12)], ids=str)
 @pytest.mark.parametrize("depot", rules.DEPOTS)
 def test_every_policy_ends(depot: str, size: tuple[int, int]) -> None:
-    """Also the one that stays at the depot whenever it may; "final" within n - 1 + m decisions, all cities visited."""
+    """Also the policy that stays at the depot if it may; "final" within n - 1 + m decisions, all cities visited."""
     policies = [*PLAYERS, lambda oracle, rng: int(np.argmax(oracle.legal_actions()))]
-    how = rules.make_rules(*size, 0.01, depot, "sparse", None)
-    game = Game(np.random.default_rng(1).random((4, size[0], 2)), size[1], how, tuple(policies), seed=2)
+    game_rules = rules.make_rules(*size, 0.01, depot, "sparse", None)
+    game = Game(np.random.default_rng(1).random((4, size[0], 2)), size[1], game_rules, tuple(policies), seed=2)
     traces = play(game)
     check_face("numpy", game, traces)
     for trace in traces:
-        assert len(trace.actions) <= (how.max_decisions if depot == "open" else sum(size) - 1)
+        assert len(trace.actions) <= (game_rules.max_decisions if depot == "open" else sum(size) - 1)
         assert depot == "open" or not trace.end.truncated
     assert not traces[0].end.truncated and not traces[2].end.truncated
 
@@ -209,13 +209,17 @@ def test_the_depot_rules_by_hand(
 ) -> None:
     """Two agents, four cities at ten ticks from the depot."""
     nodes = np.array([[0.5, 0.5], [0.5, 0.6], [0.5, 0.4], [0.6, 0.5], [0.4, 0.5]])
-    how = rules.make_rules(5, 2, 0.01, depot, "sparse", None)
+    game_rules = rules.make_rules(5, 2, 0.01, depot, "sparse", None)
     oracle, state = Oracle(nodes, 2, 0.01, depot), rules.start(Problem(2, {"nodes": nodes[None]}))
     for action, legal, tick in zip(actions, depot_is_legal, ticks, strict=True):
-        assert rules.legal_actions(state, how, rules.agent_to_decide(state))[0, 0] == oracle.legal_actions()[0] == legal
+        assert (
+            rules.legal_actions(state, game_rules, rules.agent_to_decide(state))[0, 0]
+            == oracle.legal_actions()[0]
+            == legal
+        )
         assert state.ready.min() == oracle.tick == tick
         oracle.step(action)
-        state = rules.depart(state, how, np.array([action]))
+        state = rules.depart(state, game_rules, np.array([action]))
     assert state.length[0].tolist() == pytest.approx(lengths)
 
 

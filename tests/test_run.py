@@ -1,4 +1,4 @@
-"""Whatever a solver does gives a row; rows on disk are complete and are not measured again."""
+"""Every outcome of a solver becomes a row; rows on disk are complete and are not measured again."""
 
 import json
 import math
@@ -47,7 +47,7 @@ def alive(pid: int) -> bool:
 def wait_until(condition, seconds=60.0):
     end = time.monotonic() + seconds
     while not condition():
-        assert time.monotonic() < end, "it never came true"
+        assert time.monotonic() < end, f"still false after {seconds} s"
         time.sleep(0.02)
 
 
@@ -112,7 +112,7 @@ def test_every_kind_of_failure_is_a_row(tmp_path, monkeypatch):
         row = results[method]
         assert (row.status, row.tours, row.makespan) == (status, None, None), method
         assert row.error.startswith(error)
-    assert results["deals"].ok  # the last, after all of them
+    assert results["deals"].ok  # it runs last
 
 
 def test_what_hangs_is_killed_with_its_children(tmp_path, monkeypatch):
@@ -131,8 +131,8 @@ def test_a_hanging_warm_up_is_killed_too(tmp_path):
     assert (row.status, row.error) == ("timeout", "killed: not ready after 1 s")
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_a_killed_run_loses_the_running_row_alone(tmp_path, how):
+@pytest.mark.parametrize("signal_number", [signal.SIGKILL, signal.SIGINT])
+def test_a_killed_run_loses_only_the_running_row(tmp_path, signal_number):
     out = tmp_path / "rows.jsonl"
     command = [sys.executable, "-m", "benchmarks", "run", "--table", "smoke", "--out", str(out)]
     command += ["--methods", "misbehaving:hangs", "--seconds", "600"]
@@ -145,16 +145,16 @@ def test_a_killed_run_loses_the_running_row_alone(tmp_path, how):
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # in the background it may be ignored
     )
     wait_until((tmp_path / "8x2-2.pids").exists)
-    running.send_signal(how)
+    running.send_signal(signal_number)
     stderr = running.communicate(timeout=30)[1]
-    assert running.returncode == (130 if how == signal.SIGINT else -signal.SIGKILL)
-    assert how == signal.SIGKILL or b"interrupted" in stderr
+    assert running.returncode == (130 if signal_number == signal.SIGINT else -signal.SIGKILL)
+    assert signal_number == signal.SIGKILL or b"interrupted" in stderr
     pids = [int(pid) for pid in (tmp_path / "8x2-2.pids").read_text().split()]
     wait_until(lambda: not any(alive(pid) for pid in pids))
 
     whole = out.read_bytes()
     assert [row.instance for row in rows.read(out)] == [0, 1]
-    out.write_bytes(whole + whole.splitlines()[0][:100])  # as if it had been writing
+    out.write_bytes(whole + whole.splitlines()[0][:100])  # as if it had been killed while writing
     (tmp_path / "behave").touch()
     assert subprocess.run(command, cwd=ROOT, env=env, capture_output=True).returncode == 0
     assert out.read_bytes().startswith(whole)
@@ -242,7 +242,7 @@ def test_table_3_is_measured_rounded_and_not(tmp_path):
     run("3", tmp_path / "rows.jsonl", ("misbehaving:deals",), seconds=(0.1,), tsplib=folder)
     five, ten = rows.read(tmp_path / "rows.jsonl")
     assert (five.cell, ten.cell) == ("eil51x5", "eil51x10")
-    # of five agents one has cities 1, 6, ...: out to (1, 1), on to (4, 2) and home; one goes by way of (2, 0)
+    # one of five agents has cities 1, 6, ...: to (1, 1), on to (4, 2) and home; another one goes by way of (2, 0)
     assert five.rounded_length == max(1 + 3 + 4, 2 + 3 + 4, 4 + 0 + 4)
     assert five.length == pytest.approx(2 + math.sqrt(8) + math.sqrt(20))
     assert five.makespan == pytest.approx(five.length / 4)

@@ -1,4 +1,4 @@
-"""What a training run leaves behind, how it continues from there bit for bit, and what it refuses."""
+"""What a training run writes, how it is resumed bit for bit, and what it refuses."""
 
 import signal
 from dataclasses import replace
@@ -59,7 +59,7 @@ def test_a_run_is_not_overwritten_nor_resumed_as_another(tmp_path):
 
 
 def test_a_checkpoint_may_be_older_than_an_option():
-    """An option that it does not know had its default value."""
+    """Options that the checkpoint lacks had their default values."""
     older = TINY.to_dict()
     del older["average"], older["network"]["view"]
     check_same_run(older, TINY)
@@ -79,7 +79,7 @@ def test_a_damaged_checkpoint_is_refused(tmp_path):
         checkpoint.read(path)
 
 
-def test_logs_and_weights_are_left_behind(tmp_path):
+def test_logs_and_weights_are_written(tmp_path):
     learner = reinforce(replace(TINY, out=tmp_path, tensorboard=True))
     cost = np.loadtxt(tmp_path / "logs/scalars/cost.csv", delimiter=",")
     assert cost[:, 0].tolist() == [1, 2, 3, 4, 5, 6]
@@ -89,7 +89,7 @@ def test_logs_and_weights_are_left_behind(tmp_path):
     assert same(dict(continued.network.state_dict()), dict(learner.network.state_dict()))
 
 
-def test_a_network_of_ones_own_is_trained_saved_and_continued(tmp_path):
+def test_a_custom_network_is_trained_saved_and_continued(tmp_path):
     policy = "benchmarks.policies.attention_model:AttentionModel"
     learner = reinforce(replace(TINY, out=tmp_path, policy=policy, steps=2))
     assert isinstance(learner.network, AttentionModel)

@@ -47,9 +47,9 @@ def test_a_child_keeps_a_slice_of_one_parent_and_the_order_of_the_other(size):
     children = ea.cross(population, other, cuts)
     assert every_symbol_once(children)
     for child, first, second, (begin, end) in zip(children, population, other, cuts, strict=True):
-        kept = first[begin:end].tolist()
-        assert child[begin:end].tolist() == kept
-        assert [*child[:begin], *child[end:]] == [symbol for symbol in second if symbol not in kept]
+        inherited = first[begin:end].tolist()
+        assert child[begin:end].tolist() == inherited
+        assert [*child[:begin], *child[end:]] == [symbol for symbol in second if symbol not in inherited]
 
 
 def test_a_mutation_brings_a_city_next_to_its_partner(monkeypatch):
@@ -92,7 +92,7 @@ def test_two_tours_by_hand(square, square_tours):
     assert fitness == pytest.approx([2.0 + ea.MEAN_WEIGHT * 2.0, alone + ea.MEAN_WEIGHT * alone / 2])
 
 
-def test_the_fittest_survive_and_of_equals_one_first():
+def test_the_fittest_survive_and_duplicates_come_last():
     fitness = np.array([3.0, 1.0, 2.0, 1.0 + 1e-12, 5.0, 2.0])
     assert ea.survivors(fitness, 4).tolist() == [1, 2, 0, 4]
     assert ea.survivors(fitness, 6).tolist() == [1, 2, 0, 4, 3, 5]
@@ -106,7 +106,7 @@ def test_the_fittest_of_those_drawn_wins_a_tournament(monkeypatch):
     assert set(ea.tournament(fitness, 50, np.random.default_rng(0))) == {0, 1, 2}
 
 
-def test_tiny_instances_are_solved_in_time_and_again_alike():
+def test_tiny_instances_are_solved_in_time_and_reproducibly():
     for instance in Cell(8, 2, 3).instances(0):
         began = time.perf_counter()
         check_tours(instance, ea.solve(instance, 0.2, 0))

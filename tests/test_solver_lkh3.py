@@ -160,11 +160,11 @@ def test_lkh_is_given_the_instance(stand_in):
     nodes = [[0.5, 0.25], [0.5, 1.0], [0.1234567, 0.0]]
     assert lkh3.solve(Instance(nodes, 9), 30.0, 41) == [[0, 1, 0], [0, 2, 0]] + [[0, 0]] * 7
     seen = json.loads(seen.read_text())
-    given = dict(line.split(" = ") for line in seen["parameters"].splitlines() if " = " in line)
-    assert given["SALESMEN"] == "2"  # at most as many as cities
-    assert given["OPTIMUM"] == "1500000"  # out and back, in millionths
-    assert given["SEED"] == "42" and given["MTSP_OBJECTIVE"] == "MINMAX"
-    assert 0 < float(given["TOTAL_TIME_LIMIT"]) <= 30.0
+    parameters = dict(line.split(" = ") for line in seen["parameters"].splitlines() if " = " in line)
+    assert parameters["SALESMEN"] == "2"  # at most as many as cities
+    assert parameters["OPTIMUM"] == "1500000"  # out and back, in millionths
+    assert parameters["SEED"] == "42" and parameters["MTSP_OBJECTIVE"] == "MINMAX"
+    assert 0 < float(parameters["TOTAL_TIME_LIMIT"]) <= 30.0
     assert seen["problem"].partition("NODE_COORD_SECTION\n")[2].split("\n")[:3] == [
         "1 500000 250000",
         "2 500000 1000000",
@@ -194,7 +194,7 @@ def test_lkh_ends_with_a_killed_parent(stand_in):
 def wait_for(condition, seconds: float = 60.0) -> None:
     end = time.monotonic() + seconds
     while not condition():
-        assert time.monotonic() < end, "nothing happened"
+        assert time.monotonic() < end, f"still false after {seconds} s"
         time.sleep(0.01)
 
 

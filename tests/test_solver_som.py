@@ -22,7 +22,7 @@ def ring_lengths(rings: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("guided", [False, True])
-def test_tiny_instances_are_solved_in_time_and_again_alike(guided):
+def test_tiny_instances_are_solved_in_time_and_reproducibly(guided):
     som._compile()
     for instance in Cell(8, 2, 3).instances(0):
         began = time.perf_counter()
@@ -76,7 +76,7 @@ def test_the_winner_and_its_neighbours_move_towards_the_city():
     assert rings[0, 1:] == pytest.approx(before[0, 1:] + way[:, None] * (nodes[1] - before[0, 1:]))
 
 
-def test_of_two_rings_as_near_the_shorter_one_wins():
+def test_the_shorter_of_two_equally_near_rings_wins():
     nodes = np.array([[0.5, 0.5], [0.5, 0.6]])
     for long in (0, 1):
         rings = np.array([[[0.5, 0.5], [0.4, 0.6], [0.4, 0.5]], [[0.5, 0.5], [0.6, 0.6], [0.6, 0.5]]])
@@ -86,7 +86,7 @@ def test_of_two_rings_as_near_the_shorter_one_wins():
         assert winner[1] == 3 * (1 - long) + 1
 
 
-def test_one_map_parts_the_cities_of_two_agents():
+def test_one_map_divides_the_cities_between_two_agents():
     """Two bunches of cities on either side of the depot: no map should send an agent to both."""
     rng = np.random.default_rng(0)
     left, right = ([x, 0.5] + 0.1 * rng.random((10, 2)) for x in (0.0, 0.9))

@@ -1,4 +1,4 @@
-"""C decides how far samples differ, the view what agents see; the tables of both sweeps."""
+"""The effects of the clip C and of the view, and the tables of both sweeps."""
 
 import numpy as np
 import pytest

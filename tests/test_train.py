@@ -204,7 +204,7 @@ def test_the_shared_baseline_is_unbiased_but_would_not_be_if_it_included_the_sam
     assert with_itself == pytest.approx(2 / 3 * p * (1 - p), abs=1e-12)
 
 
-def test_repeated_instances_are_the_same_seen_from_eight_sides():
+def test_repeated_instances_are_symmetric_copies():
     nodes = torch.rand(2, 6, 2, dtype=torch.float64)
     repeated = repeat(Problem(2, {"nodes": nodes}), 9).nodes
     assert torch.equal(repeated[::9], nodes) and torch.equal(repeated[8::9], nodes)
@@ -247,9 +247,9 @@ def test_the_policy_is_the_running_average_of_the_weights(tmp_path):
         for name, weight in averaged.network.state_dict().items():
             expected[name] = 0.75 * expected.get(name, weight) + 0.25 * weight
     assert same(dict(plain.averaged_network.state_dict()), dict(plain.network.state_dict()))
-    kept = averaged.averaged_network.state_dict()
-    assert max(float((kept[name] - weight).abs().max()) for name, weight in expected.items()) < 1e-6
-    assert not same(dict(kept), dict(averaged.network.state_dict()))
+    averages = averaged.averaged_network.state_dict()
+    assert max(float((averages[name] - weight).abs().max()) for name, weight in expected.items()) < 1e-6
+    assert not same(dict(averages), dict(averaged.network.state_dict()))
 
 
 @pytest.mark.slow

@@ -1,7 +1,8 @@
 """The teacher: tours of the reference solver in a canonical form, and the policy that follows them.
 
-The teacher alone only shows what to do in states that it leads to. With ``roll_in`` a student plays the beginning of
-every game, including its mistakes, and the teacher continues from there (DAgger: Ross, Gordon & Bagnell 2011).
+The teacher's own games only show what to do in states that the teacher reaches. With ``roll_in`` a student plays the
+beginning of every game, including its mistakes, and the teacher continues from there (DAgger: Ross, Gordon & Bagnell
+2011).
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from train.network import load_student
 
 
 class Demonstrations(NamedTuple):
-    """A set: instances of one size, and the teacher's plan for each, which says every agent's whole tour."""
+    """A set of instances of one size, with the teacher's plan for each: every agent's whole tour."""
 
     nodes: np.ndarray  # (B, n, 2) float64
     first: np.ndarray  # (B, m) int64, each agent's first city
@@ -39,7 +40,7 @@ class Demonstrations(NamedTuple):
 
 
 def demonstrate(config: ImitateConfig, index: int) -> Demonstrations:
-    """The ``index``-th set of a run. It depends on ``config`` and ``index`` alone, wherever and whenever it is made."""
+    """The ``index``-th set of a run. It depends on ``config`` and ``index`` alone, not on the process that makes it."""
     from mtsp_env.reference import improve_batch  # imports Numba, which only the teacher needs
 
     rng = np.random.default_rng([config.seed, index])
@@ -47,7 +48,7 @@ def demonstrate(config: ImitateConfig, index: int) -> Demonstrations:
     batch = int(np.clip(config.set_tokens // n_nodes, 16, 256))
     batch = 1 << batch.bit_length() - 1  # few different shapes, so that oneDNN builds few kernels
     problem = sample(config.generator(), rng, batch, n_nodes, n_agents)
-    check_plain(problem)  # the teacher solves no other
+    check_plain(problem)  # the teacher solves plain problems only
     nodes = problem.nodes
     seed = int(rng.integers(2**31))
     begin = 0 if config.roll_in is None else int(rng.integers(n_nodes - 1))  # every game takes n - 1 decisions or more
@@ -61,7 +62,7 @@ def demonstrate(config: ImitateConfig, index: int) -> Demonstrations:
 
 def roll_in(config: ImitateConfig, problem: Problem, begin: int) -> list[Tours]:
     """The open tours after the student's first ``begin`` decisions, played greedily."""
-    config = replace(config, device="cpu")  # where the teacher works
+    config = replace(config, device="cpu")  # the teacher runs there
     env = environment(problem, config)
     with autocast(config):
         last = rollout(_student(config), env, "greedy", problem, max_decisions=begin).last

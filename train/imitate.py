@@ -1,4 +1,4 @@
-"""Imitation of the reference solver, a warm start for REINFORCE, from top to bottom."""
+"""Imitation of the reference solver: a warm start for REINFORCE."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class ImitationLearner(Learner):
         batches = self.buffer.draw(config.sets_per_step)
         waited = time.perf_counter() - start
         self.optimiser.zero_grad()
-        loss = next_loss = assignment_loss = agreed = torch.zeros((), device=config.device)  # a GPU is not waited for
-        for decisions in batches:  # each counts the same: one of 16 games at n = 200 as much as one of 256 at n = 20
+        loss = next_loss = assignment_loss = agreed = torch.zeros((), device=config.device)  # no wait for a GPU
+        for decisions in batches:  # all weigh the same: a set of 16 games at n = 200 as much as one of 256 at n = 20
             with autocast(config):
                 part = imitation_losses(self.network, decisions)
             total = part.loss + config.next_weight * part.next + config.assignment_weight * part.assignment
@@ -92,8 +92,8 @@ class ImitationLosses(NamedTuple):
     """The losses of a batch of N decisions, and how often the network agrees with the teacher."""
 
     loss: Tensor  # () mean cross-entropy with the teacher's actions, with gradients
-    next: Tensor  # () of the other agents' next nodes (``plan_losses``); 0 without plans
-    assignment: Tensor  # () of the cities' visitors; 0 without plans
+    next: Tensor  # () mean cross-entropy with the other agents' next nodes; 0 without plans
+    assignment: Tensor  # () mean cross-entropy with the cities' visitors; 0 without plans
     agreed: Tensor  # () number of decisions whose teacher's action has a probability above 1/2
 
 

@@ -53,10 +53,10 @@ def visitors(demonstrations: Demonstrations) -> np.ndarray:
     """(B, n) int64: the agent that visits each city; 0 at the depot."""
     visitor = np.zeros_like(demonstrations.following)
     agents = np.broadcast_to(np.arange(demonstrations.first.shape[1]), demonstrations.first.shape)
-    at = demonstrations.first  # (B, m)
-    while at.any():
-        np.put_along_axis(visitor, at, agents, axis=1)
-        at = np.take_along_axis(demonstrations.following, at, axis=1)
+    node = demonstrations.first  # (B, m)
+    while node.any():
+        np.put_along_axis(visitor, node, agents, axis=1)
+        node = np.take_along_axis(demonstrations.following, node, axis=1)
     visitor[:, 0] = 0
     return visitor
 

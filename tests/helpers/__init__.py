@@ -1,1 +1,1 @@
-"""What several tests share: the oracle, the faces held against it, random games, odd instances."""
+"""What several tests share: the oracle, the faces tested against it, random games, odd instances."""

@@ -1,6 +1,6 @@
 """Games to play, the oracle's way of playing them, and every face that must play them the same.
 
-To hold another face against the oracle, add a class with the five methods of ``RulesFace`` and a line of ``FACES``.
+To test another face against the oracle, add a class with the five methods of ``RulesFace`` and a line of ``FACES``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mtsp_env import Instance, mtsp_v0, rules
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.instance import Problem
 
-# Games: what is played, and by whom
+# Games, and the players that choose the actions
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def pick_any(oracle: Oracle, rng: np.random.Generator) -> int:
 
 
 def pick_home(oracle: Oracle, rng: np.random.Generator) -> int:
-    """Loves the depot: goes or stays there more often than not."""
+    """Goes to the depot or stays there with probability 0.6 or more if that is legal."""
     return 0 if oracle.legal_actions()[0] and rng.random() < 0.6 else pick_any(oracle, rng)
 
 
@@ -78,7 +78,7 @@ def random_game(seed: int, batch: int = 4) -> Game:
     rng = np.random.default_rng(seed)
     n, m = int(rng.integers(2, 61)), int(rng.integers(1, 13))
     kinds = ["uniform", *rng.choice(list(PLACES), batch - 1)]
-    how = rules.make_rules(
+    game_rules = rules.make_rules(
         n,
         m,
         speed=float(rng.choice([0.1, 0.01])),
@@ -87,7 +87,7 @@ def random_game(seed: int, batch: int = 4) -> Game:
         max_decisions=None if rng.random() < 0.75 else int(rng.integers(1, n + m)),
     )
     players = tuple(PLAYERS[i] for i in rng.integers(0, len(PLAYERS), batch))
-    return Game(np.stack([PLACES[kind](rng, n) for kind in kinds]), m, how, players, seed)
+    return Game(np.stack([PLACES[kind](rng, n) for kind in kinds]), m, game_rules, players, seed)
 
 
 @dataclass(frozen=True)
@@ -101,11 +101,18 @@ class Trace:
 
 
 def play(game: Game) -> list[Trace]:
-    """The truth: every row of the game, played through by the oracle."""
-    traces, how = [], game.rules
+    """Every row of the game, played by the oracle: the traces that all faces must reproduce."""
+    traces, game_rules = [], game.rules
     for row, player in enumerate(game.players):
         rng = np.random.default_rng([game.seed, row])
-        oracle = Oracle(game.nodes[row], game.n_agents, how.speed, how.depot, how.reward, how.max_decisions)
+        oracle = Oracle(
+            game.nodes[row],
+            game.n_agents,
+            game_rules.speed,
+            game_rules.depot,
+            game_rules.reward,
+            game_rules.max_decisions,
+        )
         trace = Trace([], [], [], oracle)
         while not oracle.done:
             trace.moments.append(Moment(oracle.agent, oracle.tick, *map(np.array, oracle.observe())))
@@ -123,8 +130,8 @@ def play_random(seed: int) -> tuple[Game, list[Trace]]:
     return game, play(game)
 
 
-# Faces: all that play by the rules. A face is built from (nodes (B, n, 2), n_agents, rules) and has the five methods
-# below; `step` is given an action for each row, 0 for those that are over.
+# Faces: all implementations of the rules. A face is built from (nodes (B, n, 2), n_agents, rules) and has the five
+# methods below; `step` is given an action for each row, 0 for rows that are over.
 
 
 class RulesFace:
@@ -132,31 +139,31 @@ class RulesFace:
 
     reward_tolerance = 1e-9
 
-    def __init__(self, array: Callable, nodes: np.ndarray, n_agents: int, how: rules.Rules):
-        self.array, self.how = array, how
+    def __init__(self, array: Callable, nodes: np.ndarray, n_agents: int, game_rules: rules.Rules):
+        self.array, self.game_rules = array, game_rules
         self.state = rules.start(Problem(n_agents, {"nodes": array(nodes)}))
         self.paid = None
 
     def moments(self) -> list[Moment]:
-        state, seen = self.state, rules.observe(self.state, self.how)
+        state, seen = self.state, rules.observe(self.state, self.game_rules)
         *seen, agent = map(np.asarray, seen)
         return [Moment(*row) for row in zip(agent, np.asarray(rules.now(state)), *seen, strict=True)]
 
     def step(self, actions: list[int]) -> None:
-        before, self.state = self.state, rules.depart(self.state, self.how, self.array(actions))
-        self.paid = rules.reward(before, self.state, self.how)
+        before, self.state = self.state, rules.depart(self.state, self.game_rules, self.array(actions))
+        self.paid = rules.reward(before, self.state, self.game_rules)
 
     def rewards(self) -> list[float]:
         return self.paid.tolist()
 
     def over(self) -> list[tuple[bool, bool]]:
         """(terminated, truncated) of each row."""
-        ends = rules.all_visited(self.state), rules.truncated(self.state, self.how)
+        ends = rules.all_visited(self.state), rules.truncated(self.state, self.game_rules)
         return list(zip(*(end.tolist() for end in ends), strict=True))
 
     def outcomes(self) -> list[tuple[float, list[list[int]]]]:
         """(cost, closed tours) of each row."""
-        cost = rules.final_cost(self.state, self.how).tolist()
+        cost = rules.final_cost(self.state, self.game_rules).tolist()
         visits, destination = np.asarray(self.state.visits), np.asarray(self.state.destination)
         return list(zip(cost, map(rules.tours, visits, destination), strict=True))
 
@@ -166,9 +173,12 @@ class AECFace:
 
     reward_tolerance = 1e-9
 
-    def __init__(self, nodes: np.ndarray, n_agents: int, how: rules.Rules):
+    def __init__(self, nodes: np.ndarray, n_agents: int, game_rules: rules.Rules):
         size = nodes.shape[1], n_agents
-        self.envs = [mtsp_v0.raw_env(*size, how.speed, how.depot, how.reward, how.max_decisions) for _ in nodes]
+        self.envs = [
+            mtsp_v0.raw_env(*size, game_rules.speed, game_rules.depot, game_rules.reward, game_rules.max_decisions)
+            for _ in nodes
+        ]
         for env, row in zip(self.envs, nodes, strict=True):
             env.reset(options={"instance": Instance(row, n_agents)})
 
@@ -203,9 +213,9 @@ class BatchedFace:
 
     reward_tolerance = 1e-5  # float32
 
-    def __init__(self, nodes: np.ndarray, n_agents: int, how: rules.Rules):
+    def __init__(self, nodes: np.ndarray, n_agents: int, game_rules: rules.Rules):
         size = nodes.shape[1], n_agents, nodes.shape[:1]
-        self.env = BatchedMTSP(*size, how.speed, how.depot, how.reward, how.max_decisions)
+        self.env = BatchedMTSP(*size, game_rules.speed, game_rules.depot, game_rules.reward, game_rules.max_decisions)
         given = TensorDict({"game": {"nodes": torch.tensor(nodes)}}, batch_size=nodes.shape[:1])
         self.td = self.env.reset(given, set_state=True)
 
@@ -215,7 +225,7 @@ class BatchedFace:
         return [Moment(*row) for row in zip(*(column.numpy() for column in columns), strict=True)]
 
     def step(self, actions: list[int]) -> None:
-        any_legal = self.td["action_mask"].to(torch.uint8).argmax(1)  # a row that is over: anything that it may do
+        any_legal = self.td["action_mask"].to(torch.uint8).argmax(1)  # for rows that are over
         action = torch.where(self.td["done"][:, 0], any_legal, torch.tensor(actions))
         self.td = step_mdp(self.env.step(self.td.set("action", action)), exclude_reward=False)
 

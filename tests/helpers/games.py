@@ -15,10 +15,10 @@ def over(env: pettingzoo.AECEnv) -> bool:
 
 
 def play(env: pettingzoo.AECEnv, seed: int = 0) -> list[tuple]:
-    """Random legal actions until the episode is over; what was seen, and done, and paid."""
-    rng, story = np.random.default_rng(seed), []
+    """Play random legal actions until the episode is over; returns (agent, observation, action, rewards) per step."""
+    rng, steps = np.random.default_rng(seed), []
     while not over(env):
         seen, agent, action = env.observe(env.agent_selection), env.agent_selection, random_action(env, rng)
         env.step(action)
-        story.append((agent, seen, action, dict(env.rewards)))
-    return story
+        steps.append((agent, seen, action, dict(env.rewards)))
+    return steps

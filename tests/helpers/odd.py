@@ -1,4 +1,4 @@
-"""Instances that are good input, though no test set has their like."""
+"""Valid instances of unusual kinds, which no test set contains."""
 
 from mtsp_env import Instance
 

@@ -1,4 +1,4 @@
-"""Algorithm 1 of the paper, written out literally and slowly: the truth that ``mtsp_env.rules`` is held against.
+"""Algorithm 1 of the paper, written out literally and slowly, to test ``mtsp_env.rules`` against it.
 
 Ticks pass one by one, a loop over the agents runs inside each, and an agent's remaining travel distance g is lowered at
 the end of its turn in that loop. Plain Python floats and lists; nothing of ``mtsp_env`` is imported.
@@ -31,7 +31,7 @@ class Oracle:
         speed: distance per tick.
         depot: "open" or "final".
         reward: "sparse" or "shaped".
-        max_decisions: the game is cut off after so many; by default 20 (n + m).
+        max_decisions: the game is cut off after this many; by default 20 (n + m).
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class Oracle:
         self.paths = [[0] for _ in range(self.m)]  # every choice in turn, waits at the depot included
         self.leg = [0.0] * self.m  # length of the current leg
         self.travelled = [0] * self.m  # ticks spent on it
-        self.closed = [False] * self.m  # depot "final": not asked again
+        self.closed = [False] * self.m  # depot "final": decides no more
         self._algorithm = self._algorithm_1()
         self.agent: int = next(self._algorithm)
 
@@ -123,8 +123,10 @@ class Oracle:
         return [home, *(not seen for seen in self.visited[1:])]
 
     def _stands_at_depot(self, j: int) -> bool:
-        """It is there already, or arrived there by this tick. Agents before the deciding one (j < i) have had their g
-        lowered towards the next tick, which is when they arrive."""
+        """Whether agent j is at the depot or arrived there by this tick.
+
+        Agents before the deciding one (j < i) have had their g lowered towards the next tick, at which they arrive.
+        """
         ticks = self.travelled[j] - (j < self.agent)
         arrived = ticks >= 1 and self.leg[j] / self.speed - ticks <= TICK_TOLERANCE
         return self.paths[j][-1] == 0 and (self.leg[j] == 0 or arrived)
@@ -162,6 +164,6 @@ class Oracle:
 
     @property
     def cost(self) -> float:
-        """The makespan; where cut off, plus out-and-back trips to all unvisited cities."""
+        """The makespan and, if the game was cut off, out-and-back trips to all unvisited cities."""
         trips = [2 * math.dist(self.nodes[0], self.nodes[c]) for c in range(1, self.n) if not self.visited[c]]
         return self.makespan + (math.fsum(trips) if self.truncated else 0.0)
