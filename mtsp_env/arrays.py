@@ -92,6 +92,14 @@ def append(points: Array, values: Array) -> Array:
     return joined
 
 
+def cast(array: Array, dtype: str) -> Array:
+    """The array in the dtype of that name, the same array if it has it already."""
+    if type(array) is np.ndarray:
+        return array.astype(dtype, copy=False)
+    xp, _ = library(array)
+    return xp.astype(array, getattr(xp, dtype), copy=False)
+
+
 def at_least(array: Array, low: float) -> Array:
     """The array with everything below ``low`` raised to it."""
     return np.maximum(array, low) if type(array) is np.ndarray else array.clamp(min=low)

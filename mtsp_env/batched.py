@@ -19,7 +19,7 @@ except ImportError as error:
     raise ImportError('mtsp_env.batched needs TorchRL: pip install "mtsp-env[dan]"') from error
 
 from mtsp_env import rules
-from mtsp_env.arrays import library
+from mtsp_env.arrays import cast
 from mtsp_env.checks import check_count
 from mtsp_env.distributions import Generator, check_distribution, sample
 from mtsp_env.instance import FIELDS, ArrayField, Problem, Tours, check_arrays
@@ -203,14 +203,12 @@ class BatchedMTSP(EnvBase):
 
         The same as the inherited method, without its work for TensorDicts that ask for more than a plain step.
         """
-        if tensordict.get("_step", None) is not None or tensordict.get("next", None) is not None:
+        keys = tensordict.keys()
+        if "next" in keys or "_step" in keys:
             return super().step(tensordict)
-        self._check_shape(tensordict)
-        return tensordict.set("next", self._step(tensordict))
-
-    def _check_shape(self, tensordict: TensorDictBase) -> None:
         if tensordict.batch_size != self.batch_size:
             raise ValueError(f"expected a batch size of {list(self.batch_size)}, got {list(tensordict.batch_size)}")
+        return tensordict.set("next", self._step(tensordict))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = self._checked_action(tensordict)
@@ -231,7 +229,7 @@ class BatchedMTSP(EnvBase):
         root |= {"done": over[:, None], "terminated": terminated[:, None], "truncated": truncated[:, None]}
         if before is not None:
             reward = rules.reward(before, state, self.rules, over)
-            root["reward"] = library(reward)[0].astype(reward, library(reward)[0].float32)[:, None]
+            root["reward"] = cast(reward, "float32")[:, None]
         return root, state.arrays()
 
     def _library(self, arrays: Arrays) -> dict:

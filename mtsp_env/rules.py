@@ -15,7 +15,7 @@ from typing import Annotated, Literal, NamedTuple, get_type_hints
 
 import numpy as np
 
-from mtsp_env.arrays import append, at_least, indices, library, locate, minus, norm, pick, pick_many, put
+from mtsp_env.arrays import append, at_least, cast, indices, library, locate, minus, norm, pick, pick_many, put
 from mtsp_env.checks import check_count
 from mtsp_env.instance import FIELDS, Array, ArrayField, Problem, Tours, check_plain
 
@@ -167,20 +167,21 @@ def all_visited(state: State) -> Array:
     return state.cities_left == 0
 
 
-def legal_actions(state: State, rules: Rules, agent: Array) -> Array:
+def legal_actions(state: State, rules: Rules, agent: Array, here: Array | None = None) -> Array:
     """(B, n) bool: the nodes that ``agent`` (B,) may pick: unvisited cities, and the depot by ``rules.depot``.
 
     "open": always, unless all agents stand at the depot and cities remain, so that something moves.
     "final": not before the agent's first city, nor by the last agent still out while cities remain.
-    When every city is visited only the depot is legal, so a mask is never empty.
+    When every city is visited only the depot is legal, so a mask is never empty. ``here`` (B,) is the node of
+    ``agent``, if that is known already.
     """
     mask = ~state.visited  # (B, n)
     if rules.depot == "open":
         underway = (state.leg > 0) & (state.ready > now(state)[:, None])
         depot = ((state.destination != 0) | underway).any(1)
     else:
-        has_left = pick(state.destination, locate(agent, state.ready.shape[1])) != 0
-        depot = has_left & (state.closed < state.ready.shape[1] - 1)
+        here = pick(state.destination, locate(agent, state.ready.shape[1])) if here is None else here
+        depot = (here != 0) & (state.closed < state.ready.shape[1] - 1)
     mask[:, 0] = depot | all_visited(state)
     return mask
 
@@ -200,7 +201,6 @@ def observe(state: State, rules: Rules, agent: Array | None = None) -> Observati
     Algorithm 1 lowers g inside the loop over agents, so agent i sees the agents before it (j < i) one tick further on.
     An agent underway sees the world from its destination, where it will decide next; a decider's own row is (0, 0, 0).
     """
-    xp, _ = library(state.seen_nodes)
     decider = agent_to_decide(state)
     agent = decider if agent is None else agent
     n_nodes, n_agents = state.visited.shape[1], state.ready.shape[1]
@@ -210,14 +210,14 @@ def observe(state: State, rules: Rules, agent: Array | None = None) -> Observati
     heading = pick_many(cities, state.destination)  # (B, m, 2)
 
     before = indices(state.ready, axis=1) < agent[:, None]  # (B, m): j < i
-    elapsed = xp.astype(tick[:, None] + before - state.departed, xp.float64) + TICK_TOLERANCE
+    elapsed = cast(tick[:, None] + before - state.departed, "float64") + TICK_TOLERANCE
     remaining = at_least(state.leg - rules.speed * elapsed, 0.0)  # (B, m)
 
     return Observation(
         cities=cities,
         agents=append(heading, remaining),
         visited=state.visited,
-        action_mask=legal_actions(state, rules, agent),
+        action_mask=legal_actions(state, rules, agent, here),
         agent=agent,
     )
 
@@ -240,7 +240,7 @@ def depart(state: State, rules: Rules, action: Array, agent: Array | None = None
         problem=state.problem,
         seen_nodes=state.seen_nodes,
         visited=put(state.visited, goal, is_city),
-        cities_left=state.cities_left + ~is_city - 1,
+        cities_left=state.cities_left - cast(is_city, "int64"),
         visits=put(state.visits, goal, _visit_code(n_nodes - state.cities_left, agent, here == 0, n_agents)),
         destination=put(state.destination, own, action),
         leg=put(state.leg, own, leg),
@@ -254,8 +254,7 @@ def depart(state: State, rules: Rules, action: Array, agent: Array | None = None
 
 def travel_ticks(leg: Array, speed: float) -> Array:
     """Ticks that a leg takes: max(1, ceil(leg / speed)), int64. A stay takes one tick."""
-    xp, _ = library(leg)
-    return xp.astype(at_least(xp.ceil(leg / speed - TICK_TOLERANCE), 1.0), xp.int64)
+    return cast(at_least(library(leg)[0].ceil(leg / speed - TICK_TOLERANCE), 1.0), "int64")
 
 
 def makespan(state: State) -> Array:
@@ -304,8 +303,7 @@ def reward(before: State, after: State, rules: Rules, over: Array | None = None)
 
 def _visit_code(order: Array, agent: Array, from_depot: Array, n_agents: int) -> Array:
     """(B,) int32."""
-    xp, _ = library(order)
-    return xp.astype((order * n_agents + agent) * 2 + from_depot, xp.int32)
+    return cast((order * n_agents + agent) * 2 + from_depot, "int32")
 
 
 def tours(visits: np.ndarray, destination: np.ndarray, close: bool = True) -> Tours:
