@@ -5,23 +5,20 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip
 INSTALL := $(PIP) install --quiet --constraint constraints.txt
 
-.PHONY: demo test test-fast coverage lint types wheel clean
+.PHONY: demo test test-fast lint types wheel clean
 
 # Plans the tours of the examples with the shipped network and says where the pictures are.
 demo: $(VENV)/.demo
 	$(BIN)/mtsp solve examples/*.tsp --agents 4 --plot tours.png
 
-# The whole test suite.
+# The whole test suite on all cores; lists the lines of mtsp_env and dan_policy that no test runs, and fails if more than 5 %
+# are missed.
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses auto --cov --cov-report=term
 
 # The quick tests alone, on all cores: less than a minute.
 test-fast: $(VENV)/.dev
 	$(BIN)/python -m pytest -m "not slow and not gpu" --numprocesses auto
-
-# The whole test suite; lists the lines of mtsp_env and dan_policy that no test runs, and fails if more than 5 % are missed.
-coverage: $(VENV)/.dev
-	$(BIN)/python -m pytest --cov --cov-report=term
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
