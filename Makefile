@@ -16,7 +16,7 @@ demo: $(VENV)/.demo
 test: $(VENV)/.dev
 	$(BIN)/python -m pytest --numprocesses auto --cov --cov-report=term
 
-# The quick tests alone, on all cores: less than a minute.
+# The quick tests alone, on all cores: about two minutes on two cores.
 test-fast: $(VENV)/.dev
 	$(BIN)/python -m pytest -m "not slow and not gpu" --numprocesses auto
 
