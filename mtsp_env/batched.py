@@ -62,7 +62,8 @@ class BatchedMTSP(EnvBase):
         seed: of the instances; a row's instance depends on the order of resets alone.
         check_actions: raise ValueError on an illegal action. On a GPU this waits for the device at each step: switch it
             off if the policy is masked.
-        compile: True, or a dict of options of ``torch.compile``, calls ``compile`` (TorchRL takes care of it).
+        compile: True, or a dict of options of ``torch.compile``: TorchRL then calls ``compile``. Not worth it on a CPU,
+            where NumPy is faster.
 
     Raises:
         ValueError: an argument outside its range, nodes outside the unit square, or an illegal action.
