@@ -130,6 +130,9 @@ SOLVERS: dict[str, Solver] = {
     "dan-s256": _policy("dan", weights="default", samples=256),
     "dan-paper-greedy": _policy("dan", weights="paper", policy="paper"),
     "dan-paper-s64": _policy("dan", weights="paper", policy="paper", samples=64),
+    "joint-greedy": _policy("dan", weights="joint", policy="joint"),
+    "joint-greedy-x8": _policy("dan", weights="joint", policy="joint", augment=True),
+    "joint-s64": _policy("dan", weights="joint", policy="joint", samples=64),
     "dan-improve": _policy("improved_dan", "numba", anytime=True, polishes=True, weights="default"),
     "reference": _ours("reference:solve", "numba"),
     "ortools": _ours("ortools:solve", "ortools", search="greedy_descent"),
@@ -145,6 +148,7 @@ SOLVERS: dict[str, Solver] = {
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "dan": ("dan-greedy", "dan-greedy-x8", "dan-s64", "dan-s64-x8", "dan-s256", "dan-improve"),
+    "joint": ("joint-greedy", "joint-greedy-x8", "joint-s64"),
     "all": tuple(SOLVERS),
 }
 
