@@ -214,7 +214,7 @@ def _published_gaps(results: Results) -> list[Line]:
     lines = []
     for name, columns in _published(results, "cost", ".8g").items() if results.public_best else ():
         gaps = [
-            f"{100 * (float(text) / results.public_best[cell.label] - 1):.2f}"
+            f"{round(100 * (float(text) / results.public_best[cell.label] - 1), 2) + 0.0:.2f}"  # never -0.00
             if text and cell.label in results.public_best
             else ""
             for text, cell in zip(columns, results.cells, strict=True)
