@@ -186,7 +186,11 @@ def test_the_command_takes_better_tours_and_verifies(tmp_path, monkeypatch, caps
 
 
 @pytest.mark.parametrize(
-    "name", ["random", "nearest", "dan-greedy", "dan-greedy-x8", "dan-s64-x8", "dan-improve", "reference"]
+    "name",
+    [
+        *("random", "nearest", "dan-greedy", "dan-greedy-x8", "dan-s64-x8", "dan-improve", "reference"),
+        *("joint-greedy", "joint-greedy-x8", "joint-s64", "schedulenet-greedy", "schedulenet-s64"),
+    ],
 )
 def test_our_solvers_solve_tiny_instances_and_repeat_themselves(name):
     for instance in [*CELL.instances(0), *Cell(3, 5, 1).instances(0)]:
@@ -205,6 +209,16 @@ def test_naming_solvers_loads_none_and_each_has_a_file():
     assert not missing
 
 
+def test_rows_name_the_weights_behind_every_network():
+    """Solvers with the same weights have the same hash, and a team's weights are part of that of its solver."""
+    hashes = {name: solver.versions().get("weights") for name, solver in solvers.SOLVERS.items()}
+    assert hashes["dan-greedy"] == hashes["dan-s64"] and hashes["joint-greedy"] == hashes["joint-s64"]
+    assert hashes["schedulenet-greedy"] == hashes["schedulenet-s64"] and hashes["hu-greedy"] == hashes["hu-s64"]
+    different = {hashes[f"{name}-greedy"] for name in ("dan", "joint", "dan-paper", "schedulenet", "hu")}
+    assert len(different) == 5 and None not in different
+    assert hashes["nearest"] is hashes["reference"] is None
+
+
 def test_solvers_are_loaded_by_name(tmp_path, monkeypatch):
     (tmp_path / "needy.py").write_text("import a_package_that_nobody_has")
     monkeypatch.syspath_prepend(tmp_path)
@@ -213,6 +227,7 @@ def test_solvers_are_loaded_by_name(tmp_path, monkeypatch):
     dan = ["dan-greedy", "dan-greedy-x8", "dan-s64", "dan-s64-x8", "dan-s256", "dan-improve"]
     assert solvers.expand(["nearest, dan", "dan-s64"]) == ["nearest", *dan]
     assert solvers.expand(["all"]) == list(solvers.SOLVERS)
+    assert solvers.expand(["joint"]) == ["joint-greedy", "joint-greedy-x8", "joint-s64"]
     with pytest.raises(ValueError, match="unknown solver 'magic'; choose from"):
         solvers.find("magic")
     with pytest.raises(ValueError, match="no solver at 'misbehaving:magic'"):

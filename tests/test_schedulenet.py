@@ -5,7 +5,18 @@ from dataclasses import replace
 import pytest
 import torch
 
-from benchmarks.policies.schedulenet import N_TYPES, ScheduleNet, TypeInteraction
+from benchmarks.policies.schedulenet import (
+    ASSIGNED_AGENT,
+    ASSIGNED_TASK,
+    DEPOT,
+    N_TYPES,
+    UNASSIGNED_AGENT,
+    UNASSIGNED_TASK,
+    ScheduleNet,
+    TypeAwareAttention,
+    TypeInteraction,
+    agent_task_graph,
+)
 from dan_policy import make_actor, solve
 from dan_policy.heuristics import default_view
 from mtsp_env import Instance, check_tours
@@ -101,6 +112,59 @@ def test_the_depot_alone_can_be_chosen(network):
     visited[:, 1:] = True
     logits = network(cities, agents, visited, agent)
     assert logits.isfinite().all() and (logits.argmax(1) == 0).all()
+
+
+def test_the_graph_by_hand():
+    """Four agents: the one that decides, one at the depot, one on its way home and one on its way to a city."""
+    seen = torch.tensor([[[0.3, 0.4], [1.0, 0.0]]])  # the depot and the last unvisited city
+    agents = torch.tensor([[[0.0, 0.0, 0.0], [0.3, 0.4, 0.0], [0.3, 0.4, 0.2], [0.0, 2.0, 0.7]]])
+    nodes, edges, graph = agent_task_graph(seen, None, agents)
+    agent_types = [UNASSIGNED_AGENT, UNASSIGNED_AGENT, ASSIGNED_AGENT, ASSIGNED_AGENT]
+    assert graph.types.tolist() == [agent_types + [ASSIGNED_TASK] * 4 + [DEPOT, UNASSIGNED_TASK]]
+    members = [
+        [part.start + i for i, is_member in enumerate(flags[0]) if is_member]
+        for part, flags in zip(graph.slices, graph.members, strict=True)
+    ]
+    assert members == [[2, 3], [0, 1], [7], [9], [8]]  # the city of the last agent is the only assigned task
+    torch.testing.assert_close(nodes[0, 3], torch.tensor([0.0, 2.0, 0.7, 1.0]))
+    torch.testing.assert_close(nodes[0, 7], torch.tensor([0.0, 2.0, 0.0, 1.0]))
+    torch.testing.assert_close(nodes[0, 9], torch.tensor([1.0, 0.0, 0.0, 0.0]))
+    edges = edges[0, :, :, 0]
+    assert edges[0, 8].item() == pytest.approx(0.5)  # from the deciding agent to the depot
+    assert edges[9, 3].item() == pytest.approx(0.7 + 5**0.5)  # the last agent reaches its city, then goes on
+    assert edges[2, 3].item() == pytest.approx(0.2 + 0.7 + (0.3**2 + 1.6**2) ** 0.5)
+
+
+def test_a_layer_equals_its_definition_edge_by_edge():
+    """App. A, Eqs. 10 to 18, as loops over the nodes of one graph."""
+    torch.manual_seed(0)
+    cities, agents, visited, _ = observation(batch=1)
+    nodes, edges, graph = agent_task_graph(cities[:, ~visited[0]], None, agents)
+    layer = TypeAwareAttention(nodes.shape[-1], 1, 8)
+    new_nodes, new_edges = layer(nodes, edges, graph)
+    types = graph.types[0].tolist()
+    in_graph = {
+        part.start + i: kind
+        for kind, (part, flags) in enumerate(zip(graph.slices, graph.members, strict=True))
+        for i, is_member in enumerate(flags[0])
+        if is_member
+    }
+    weights, bias = layer.edge_interaction()
+    node_weights, node_bias = layer.node_interaction()
+    for i in in_graph:
+        z, h = {}, {}
+        for j, kind in in_graph.items():
+            assert kind == types[j]
+            u = torch.cat([nodes[0, i], nodes[0, j], edges[0, i, j]]) @ weights[kind] + bias[kind]
+            h[j], z[j] = layer.edge(u), layer.attention(u)
+            torch.testing.assert_close(new_edges[0, i, j], h[j])
+        messages = []
+        for kind in range(N_TYPES):
+            of_kind = [j for j in in_graph if in_graph[j] == kind]
+            total = sum(z[j].exp() for j in of_kind)
+            messages.append(sum((z[j].exp() / total * h[j] for j in of_kind), torch.zeros(8)))
+        u = torch.cat(messages) @ node_weights[types[i]] + node_bias[types[i]]
+        torch.testing.assert_close(new_nodes[0, i], layer.node(torch.cat([nodes[0, i], u])))
 
 
 def test_the_interaction_depends_on_the_type_alone_and_is_bilinear():

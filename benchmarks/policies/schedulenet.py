@@ -110,10 +110,7 @@ class ScheduleNet(nn.Module):
         visited, agent = visited.reshape(-1, n), agent.reshape(-1)
         in_view, real = open_nodes(cities, visited, self.config.view)  # (B, k), the depot first
         seen = cities.gather(1, in_view[:, :, None].expand(-1, -1, 2))  # (B, k, 2)
-        nodes, graph = _graph(seen, real, agents)
-        place, remaining = nodes[..., :2], nodes[..., 2]
-        distance = torch.cdist(place, place, compute_mode="donot_use_mm_for_euclid_dist")  # (B, N, N)
-        edges = (distance + remaining[:, :, None] + remaining[:, None])[..., None]  # (B, N, N, 1)
+        nodes, edges, graph = agent_task_graph(seen, real, agents)
         for layer in self.layers:
             nodes, edges = layer(nodes, edges, graph)
 
@@ -213,13 +210,17 @@ def mlp(widths: Sequence[int]) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
-def _graph(seen: Tensor, real: Tensor | None, agents: Tensor) -> tuple[Tensor, Graph]:
-    """The features of the nodes (B, N, 4), and the graph: agents, their tasks, the depot and the unassigned tasks.
+def agent_task_graph(seen: Tensor, real: Tensor | None, agents: Tensor) -> tuple[Tensor, Tensor, Graph]:
+    """The graph of agents, their m tasks, the depot and the unassigned tasks, in this order.
 
     Args:
         seen: (B, k, 2), the depot and the unvisited cities.
         real: (B, k) bool, False at padding; None if there is no padding.
         agents: (B, m, 3), destinations and remaining travel distances.
+
+    Returns:
+        The features of its N = 2m + k nodes (B, N, 4) and of its edges (B, N, N, 1), and the graph. The place of the
+        task of an agent without one is not a node: ``members`` is False there.
     """
     m, k = agents.shape[1], seen.shape[1]
     destination, remaining = agents[..., :2], agents[..., 2]
@@ -238,5 +239,7 @@ def _graph(seen: Tensor, real: Tensor | None, agents: Tensor) -> tuple[Tensor, G
     types[:, :m] = torch.where(assigned, ASSIGNED_AGENT, UNASSIGNED_AGENT)
     types[:, m : 2 * m] = ASSIGNED_TASK
     types[:, 2 * m] = DEPOT
-    features = torch.cat([place, left[..., None], flag[..., None].to(seen.dtype)], dim=-1)  # (B, N, 4)
-    return features, Graph(slices, members, types)
+    nodes = torch.cat([place, left[..., None], flag[..., None].to(seen.dtype)], dim=-1)  # (B, N, 4)
+    distance = torch.cdist(place, place, compute_mode="donot_use_mm_for_euclid_dist")  # (B, N, N)
+    edges = (distance + left[:, :, None] + left[:, None])[..., None]  # (B, N, N, 1)
+    return nodes, edges, Graph(slices, members, types)
