@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from dan_policy.actor import Network, network_keys
 from dan_policy.dan import DAN, DANConfig
 from dan_policy.joint import JointConfig, JointDAN
-from mtsp_env.files import atomic_write
+from mtsp_env.writing import atomic_write
 
 FORMAT = "dan-policy-2"
 DAN_ONLY = "dan-policy-1"  # the first format, which knew no other network by name; its files are still read

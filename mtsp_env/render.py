@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mtsp_env.files import atomic_write
+from mtsp_env.writing import atomic_write
 from mtsp_env.instance import Instance
 from mtsp_env.tours import path_lengths
 

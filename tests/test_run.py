@@ -274,6 +274,7 @@ def test_table_3_is_measured_rounded_and_not(tmp_path):
         (["--workers", "0"], "workers must be a whole number of at least 1, got 0"),
         (["--workers", "100000"], "the number of cores, got 100000"),
         (["--out", "rows.jsonl.gz"], "rows.jsonl.gz: rows are appended to plain files only"),
+        (["--out", "/dev/null"], "/dev/null: rows are appended to regular files only"),
     ],
 )
 def test_bad_input_is_one_line_and_changes_nothing(tmp_path, monkeypatch, capsys, options, message):

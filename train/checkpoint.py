@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mtsp_env.files import atomic_write
+from mtsp_env.writing import atomic_write
 from train.config import RunConfig
 
 # Options that may differ between a run and its continuation; all others are part of what is being trained.
