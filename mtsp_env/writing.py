@@ -77,7 +77,7 @@ def lock(file: IO) -> None:
 
 
 def _open_stream(path: Path) -> IO[bytes] | None:
-    """``path`` opened for writing if it is a pipe or a character device, None if it is a regular file or does not exist."""
+    """``path`` opened for writing if it is a pipe or a character device; None if it is a regular file or missing."""
     descriptor = _descriptor(path)
     if descriptor is not None:  # to open the path again would start at the beginning of a file that a shell has opened
         if descriptor == 1 and sys.stdout is not None:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 @st.composite
 def broken(draw: st.DrawFn, whole: bytes, edits: int = 3) -> bytes:
-    """``whole`` after up to ``edits`` edits: bits flipped, bytes replaced, cut out, inserted, repeated, or the end lost.
+    """``whole`` after up to ``edits`` edits: bits flipped, bytes replaced, cut, inserted or repeated, or the end lost.
 
     A result may equal ``whole``: an edit can undo another.
     """
