@@ -12,7 +12,7 @@ Norm = Literal["pre", "post"]
 
 
 GREATEST = {"dim": 16_384, "heads": 1024, "layers": 1000}
-"""Greatest widths, numbers of heads and numbers of layers of a network. Beyond, building one takes hours or all memory."""
+"""Greatest widths, numbers of heads and numbers of layers: larger networks take hours or all memory to build."""
 
 GREATEST_CLIP = 1e6
 
@@ -27,7 +27,7 @@ def check_sizes(config: object, *names: str, minimum: int = 1) -> None:
 
 def check_clip(value: float) -> None:
     """Raise ValueError unless ``value`` can be the tanh_clip of a network."""
-    if type(value) not in (int, float) or not 0 < value <= GREATEST_CLIP:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value <= GREATEST_CLIP:
         raise ValueError(f"tanh_clip must be a number above 0 and at most {GREATEST_CLIP:g}, got {value!r}")
 
 
