@@ -13,6 +13,7 @@ from tiny import TINY
 from benchmarks.policies.attention_model import AttentionModel
 from dan_policy import load
 from train import checkpoint
+from train.__main__ import main
 from train.checkpoint import check_same_run
 from train.config import ReinforceConfig
 from train.reinforce import ReinforceLearner, reinforce
@@ -156,6 +157,34 @@ def test_a_custom_network_is_trained_saved_and_continued(tmp_path):
         ReinforceLearner(replace(TINY, init=str(tmp_path / "last.safetensors")))
     with pytest.raises(ValueError, match=r"package.module:factory, got 'nothing.here:at_all'"):
         ReinforceLearner(replace(TINY, policy="nothing.here:at_all"))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"policy": "os:getcwd"}, "os:getcwd must return a module or a function, got str"),
+        ({"policy": "torch.nn:Identity"}, "policy='torch.nn:Identity' has no parameters to train"),
+        (
+            {"policy": "torch.nn:Linear", "policy_options": {"in_features": 2, "out_features": 2}},
+            "policy='torch.nn:Linear' fails on an observation .*takes 2 positional arguments",
+        ),
+        ({"distribution": "os:getcwd"}, "distribution='os:getcwd' cannot be drawn from .*takes no arguments"),
+        ({"device": "meta"}, "no device 'meta' here"),
+        ({"device": "cpu:99"}, "no device 'cpu:99' here"),
+    ],
+)
+def test_what_cannot_be_trained_is_named(options, message):
+    with pytest.raises(ValueError, match=message):
+        ReinforceLearner(replace(TINY, **options))
+
+
+def test_a_lack_of_memory_is_one_line(tmp_path, capsys):
+    for option in (["--batch-size", "100000000000"], ["--validation-instances", "100000000000"]):
+        command = ["reinforce", "quick", "--steps", "1", "--network.embed-dim", "16", "--challenge-instances", "2"]
+        command += ["--validation-instances", "2", "--no-tensorboard", "--out", str(tmp_path / option[0]), *option]
+        assert main(command) == 2
+        printed = capsys.readouterr().err
+        assert printed.startswith("train: error: out of memory (") and printed.count("\n") == 1
 
 
 def test_dropping_visited_cities_can_be_switched_on_and_off_with_the_same_weights(tmp_path):
