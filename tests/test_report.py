@@ -12,10 +12,11 @@ from made_up import one_agent_does_it_all, row
 from benchmarks import best_known, suite
 from benchmarks.__main__ import main
 from benchmarks.harness import rows
-from benchmarks.reports import statistics
+from benchmarks.reports import plots, statistics
 from benchmarks.reports.markdown import markdown_table
 from benchmarks.reports.report import report
 from benchmarks.reports.tables import BOUND
+from benchmarks.solvers import SOLVERS
 from mtsp_env import makespan
 
 INSTANCES = suite.cells("smoke")[0].instances(7)
@@ -143,6 +144,8 @@ def test_the_public_test_set_is_compared_with_published_numbers_of_the_same_inst
     best_known.merge(cell, 3333, dict.fromkeys(range(100), tours), kept)
     mean = np.mean([makespan(i, tours) for i in cell.instances(3333)])
     assert line_of(report([path]), "Gap", "*DPN, published*") == [f"{100 * (2.2693 / mean - 1):.2f}", ""]
+    report([path], out=tmp_path / "report")
+    assert (tmp_path / "report" / "gaps-seed3333.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_failures_are_counted_in_notes(tmp_path):
@@ -280,6 +283,11 @@ def test_a_folder_gets_the_tables_and_the_pictures(tmp_path, capsys):
     for name in names[1:]:
         assert (out / name).read_bytes().startswith(b"\x89PNG")
         assert f"]({name})" in (out / "report.md").read_text(encoding="utf-8")
+
+
+def test_every_solver_has_a_style_of_its_own():
+    assert set(plots.STYLE) == set(SOLVERS)
+    assert len(set(plots.STYLE.values())) == len(SOLVERS)
 
 
 def test_rows_come_back_as_they_were_written():
