@@ -41,15 +41,20 @@ class raw_env(AECEnv):
     ``agent_selection`` is the agent that has just arrived. It observes a dict of
 
     - ``observation``: ``cities`` (n, 2) float32, node coordinates minus its own; ``agents`` (m, 3) float32, every
-      agent's destination minus its own position, and the distance that it still has to go; ``visited`` (n,) bool, the
-      global mask; ``agent``, its index, a scalar int64.
+      agent's destination minus its own position, and the time that it still needs, in the plain problem a distance;
+      ``visited`` (n,) bool, the global mask; ``agent``, its index, a scalar int64. In worlds also some of
+      ``agent_speeds``, ``agent_alive``, ``service``, ``agent_known`` and ``city_known``.
     - ``action_mask``: (n,) int8, its legal next nodes. ``env.action_space(agent).sample(mask)`` picks one of them.
 
     Its action is the node to go to next. When every city is visited all agents terminate at once, with the reward
     -makespan. The last infos hold ``makespan`` (in the unit square; if truncated, with the penalty); with
     ``reference``, also ``reference_makespan``, of near-optimal tours for the same instance, and ``regret``,
     ``makespan / reference_makespan - 1``: 0.1 means 10 % longer. ``env.unwrapped.tours`` are the tours, during a game
-    and after it.
+    and after it, and ``env.unwrapped.log`` is the log of all legs with their times.
+
+    With ``scenario``, the game is played in a world in which cities appear, agents break down, roads delay or agents
+    differ; docs/problem.md says what each world field means. Use the depot rule "wait" there: an agent with nothing to
+    do is asked again only when something happens.
 
     A running game can be copied (``copy.deepcopy``) and pickled; the copy goes on exactly as the original would.
 
@@ -68,21 +73,26 @@ class raw_env(AECEnv):
         n_nodes: n, the depot included, at least 2.
         n_agents: m, at least 1.
         speed: distance per tick of the clock, at least 1e-9.
-        depot: "open" (the paper) or "final", see ``mtsp_env.rules.Rules``.
+        depot: "open" (the paper), "wait" or "final", see ``mtsp_env.rules.Rules``.
         reward: "sparse" or "shaped", see ``mtsp_env.rules.Rules``.
         max_decisions: truncation, by default after 20 (n + m) decisions.
-        distribution: a key of ``mtsp_env.DISTRIBUTIONS``, or a function ``(rng, batch, n_nodes, n_agents) -> dict of
-            arrays``, see ``mtsp_env.distributions``.
+        distribution: where the nodes lie: a key of ``mtsp_env.DISTRIBUTIONS``, or a function ``(rng, batch, n_nodes,
+            n_agents) -> dict of arrays``, see ``mtsp_env.distributions``.
         render_mode: None, "rgb_array" or "human" (both need the extra ``render``).
         reference: measure regret. ``mtsp_env.reference.improve`` solves the instance as its first episode ends, with
             its default iterations and seed, so the same instance always has the same ``reference_makespan``: about
             0.1 s at n = 50, 3 s at n = 1000 (extra ``reference``).
         info_tours: put ``tours`` into the last infos as well. Lists of unequal lengths break the batches of some
             libraries.
+        scenario: the world: a key of ``mtsp_env.SCENARIOS``, or a function of the same form. It decides which world
+            fields all instances of this environment have; a function is called once at creation to find out.
+        view: an agent knows the nearest ``view`` open cities only; None: all.
+        hearing: an agent hears only of agents whose destination is at most this far away; None: of all.
 
     Raises:
         ImportError: ``reference`` without Numba.
-        ValueError: an argument outside its range, an instance of another size, or an illegal action; nothing changes.
+        ValueError: an argument outside its range, an instance of another size or with other world fields, or an illegal
+            action; nothing changes.
     """
 
     metadata: ClassVar[dict[str, Any]] = {
