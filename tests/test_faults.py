@@ -56,7 +56,7 @@ def start(*arguments, **environment):
 def kill_at_random(process, lines, rng):
     """Kill a process a moment after ``lines()``, what it has written so far, has grown by some lines."""
     goal = lines() + rng.randint(1, STEPS_PER_ROUND // 4)
-    wait_until(lambda: lines() >= goal or process.poll() is not None)
+    wait_until(lambda: lines() >= goal or process.poll() is not None, seconds=600)
     moment = time.monotonic() + rng.uniform(0.0, 0.1)
     while time.monotonic() < moment:
         pass

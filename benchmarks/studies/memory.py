@@ -139,5 +139,6 @@ def measure(name: str, rounds: int) -> Memory:
             warm = process.memory_info().rss
     end, seconds = process.memory_info().rss, time.perf_counter() - start
     case.close()
-    unit = 1 if sys.platform == "darwin" else 1024  # of ru_maxrss
-    return Memory(warm, end, unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, seconds)
+    unit = 1 if sys.platform == "darwin" else 1024  # of ru_maxrss, which may lag a little behind
+    peak = max(warm, end, unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+    return Memory(warm, end, peak, seconds)
