@@ -18,6 +18,7 @@ COMMANDS = {
     "optima": "benchmarks.studies.optima:main",
     "libraries": "benchmarks.studies.libraries:main",
     "speed": "benchmarks.studies.speed:main",
+    "memory": "benchmarks.studies.memory:main",
     "sweep-clip": "benchmarks.studies.sweeps:sweep_clip",
     "sweep-view": "benchmarks.studies.sweeps:sweep_view",
     "ablations": "benchmarks.studies.ablations:main",
