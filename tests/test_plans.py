@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import torch
 from helpers.states import same
+from tiny import TINY_PLANS as TINY
 
 from dan_policy.dan import DAN, DANConfig
-from dan_policy.joint import DenseLogits, JointConfig, JointDAN
+from dan_policy.joint import DenseLogits, JointDAN
 from dan_policy.registry import load
 from mtsp_env.instance import Problem
 from train import checkpoint
 from train.baseline import better
 from train.buffer import Buffer
 from train.collect import costs
-from train.config import ImitateConfig
 from train.demonstrations import Demonstrations, as_decisions, as_links, demonstrate
 from train.imitate import ImitationLearner, imitate, imitation_losses, learns_plans, rate
 from train.network import observation_keys
@@ -25,26 +25,7 @@ from train.plans import PLAN_KEYS, add_plans, plan_losses, visitors
 
 pytest.importorskip("numba", reason="the teacher is compiled with Numba")
 
-JOINT = JointConfig(embed_dim=16, feedforward_dim=32, n_heads=2, n_layers=1)
-TINY = ImitateConfig(
-    policy="joint",
-    joint=JOINT,
-    n_nodes=(6, 9),
-    n_agents=(1, 3),
-    nodes_per_agent=2,
-    set_tokens=100,
-    buffer=3,
-    sets_per_step=2,
-    workers=0,
-    teacher_iterations=20,
-    warmup=2,
-    steps=12,
-    average=0.5,
-    validate_every=4,
-    validation_instances=8,
-    checkpoint_every=4,
-    tensorboard=False,
-)
+JOINT = TINY.joint
 KEYS = ("cities", "agents", "visited", "agent", "action_mask", ("game", "destination"))
 
 

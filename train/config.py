@@ -13,6 +13,7 @@ from dan_policy.joint import JointConfig
 from dan_policy.registry import NETWORKS
 from mtsp_env.checks import check_count, check_seconds
 from mtsp_env.distributions import Generator, check_distribution
+from train.optimisers import OptimiserName
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -273,14 +274,16 @@ class ImitateConfig(RunConfig):
     workers: int = 1
     """Processes that prepare sets while the network learns. 0: the learning process prepares them itself."""
 
+    optimiser: OptimiserName = "adamw"
+    """adamw for all parameters, or muon for the matrices of the hidden layers and adamw for the others."""
     learning_rate: float = 5e-4
-    """Peak of AdamW's learning rate, after a linear warm-up; then it falls along half a cosine."""
+    """Peak learning rate, after a linear warm-up; then it falls along half a cosine."""
     final_rate: float = 0.02
     """Final learning rate as a share of the peak."""
     warmup: int = 200
     """Steps of the warm-up."""
     weight_decay: float = 0.01
-    """AdamW's weight decay."""
+    """Weight decay, decoupled from the gradient as in AdamW."""
     anneal_seconds: float | None = None
     """The learning rate reaches its final value after this many seconds of training, even before `steps` are reached.
     Such a run follows the clock, and does not resume bit for bit."""

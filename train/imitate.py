@@ -21,6 +21,7 @@ from train.learner import Learner
 from train.loop import check_folder, run
 from train.loss import log_probs
 from train.network import observation_keys
+from train.optimisers import make_optimiser
 from train.plans import plan_losses
 
 
@@ -31,9 +32,7 @@ class ImitationLearner(Learner):
 
     def __init__(self, config: ImitateConfig):
         super().__init__(config)
-        self.optimiser = torch.optim.AdamW(
-            self.network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
-        )
+        self.optimiser = make_optimiser(config.optimiser, self.network, config.learning_rate, config.weight_decay)
         self.schedule = torch.optim.lr_scheduler.LambdaLR(self.optimiser, lambda step: rate(config, step, self.seconds))
         plans = learns_plans(self.network, config)
         self.buffer = Buffer(config, observation_keys(self.network), self.rng, plans)
