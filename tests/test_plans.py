@@ -11,7 +11,8 @@ from helpers.states import same
 from tiny import TINY_PLANS as TINY
 
 from dan_policy.dan import DAN, DANConfig
-from dan_policy.joint import DenseLogits, JointDAN
+from dan_policy.joint import JointDAN
+from dan_policy.layers import DenseLogits
 from dan_policy.registry import load
 from mtsp_env.instance import Problem
 from train import checkpoint
@@ -19,9 +20,10 @@ from train.baseline import better
 from train.buffer import Buffer
 from train.collect import costs
 from train.demonstrations import Demonstrations, as_decisions, as_links, demonstrate
-from train.imitate import ImitationLearner, imitate, imitation_losses, learns_plans, rate
+from train.imitate import ImitationLearner, imitate
 from train.network import observation_keys
 from train.plans import PLAN_KEYS, add_plans, plan_losses, visitors
+from train.supervised import imitation_losses, learns_plans, rate
 
 pytest.importorskip("numba", reason="the teacher is compiled with Numba")
 
@@ -106,16 +108,26 @@ def test_the_policys_loss_is_the_same_with_and_without_plans(decisions):
     torch.manual_seed(0)
     network = JointDAN(JOINT)
     with torch.no_grad():
-        dense, plain = imitation_losses(network, decisions), imitation_losses(network, decisions.exclude("plan"))
+        dense, plain = (imitation_losses(network, part, TINY) for part in (decisions, decisions.exclude("plan")))
     assert float(dense.loss) == pytest.approx(float(plain.loss), rel=1e-5) and dense.agreed == plain.agreed
     assert dense.next > 0 and dense.assignment > 0 and plain.next == plain.assignment == 0
+
+
+def test_dan_learns_who_visits_each_city():
+    dan = DANConfig(embed_dim=16, feedforward_dim=32, n_heads=2, city_layers=1, prune_visited=True, assignment=True)
+    learner = ImitationLearner(replace(TINY, policy="dan", network=dan, learning_rate=1e-2))
+    logs = [learner.train_step() for _ in range(12)]
+    assert all(log["next_loss"] == 0.0 for log in logs)
+    assert 0 < logs[-1]["assignment_loss"] < logs[0]["assignment_loss"]
 
 
 def test_weights_of_zero_and_networks_without_the_outputs_need_no_plans():
     joint, dan = JointDAN(JOINT), DAN(DANConfig(embed_dim=16, feedforward_dim=32, n_heads=2))
     off = replace(TINY, next_weight=0.0, assignment_weight=0.0)
     assert learns_plans(joint, TINY) and not learns_plans(joint, off) and not learns_plans(dan, TINY)
-    for network, config in ((joint, TINY), (joint, off), (dan, TINY)):
+    dense_dan = DAN(replace(dan.config, assignment=True))
+    assert learns_plans(dense_dan, TINY) and not learns_plans(dense_dan, replace(TINY, assignment_weight=0.0))
+    for network, config in ((joint, TINY), (joint, off), (dan, TINY), (dense_dan, TINY)):
         plans = learns_plans(network, config)
         keys = observation_keys(network)
         batch = Buffer(config, keys, np.random.default_rng(0), plans).draw(1)[0]

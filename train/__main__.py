@@ -1,4 +1,4 @@
-"""``python -m train imitate [options]``, ``reinforce {paper,refine,quick} [options]``, ``average``, ``validate``."""
+"""``python -m train {imitate, reinforce, improve, average, validate} [options]``."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ import tyro
 
 from train.average import average
 from train.imitate import imitate
+from train.improve import improve
 from train.reinforce import reinforce
 from train.validate import validate
 
 app = tyro.extras.SubcommandApp()
-for command in (imitate, reinforce, average, validate):
+for command in (imitate, reinforce, improve, average, validate):
     app.command(command)
 
 
