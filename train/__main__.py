@@ -1,4 +1,4 @@
-"""``python -m train {imitate, reinforce, improve, average, validate} [options]``."""
+"""``python -m train {recipe, imitate, reinforce, improve, average, validate} [options]``."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from train.average import average
 from train.imitate import imitate
 from train.improve import improve
 from train.reinforce import reinforce
+from train.stages import recipe
 from train.validate import validate
 
 app = tyro.extras.SubcommandApp()
-for command in (imitate, reinforce, improve, average, validate):
+for command in (recipe, imitate, reinforce, improve, average, validate):
     app.command(command)
 
 

@@ -188,6 +188,8 @@ class ReinforceConfig(RunConfig):
     """Factor on the learning rate every `decay_every` steps."""
     decay_every: int = 1024
     """Steps between two decays of the learning rate."""
+    warmup: int = 0
+    """Steps in which the learning rate rises linearly at the beginning, for weights that were trained before."""
 
     challenge_every: int = 128
     """Steps between challenges of the baseline."""
@@ -205,6 +207,7 @@ class ReinforceConfig(RunConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check_at_least(1, "batch_size", "chunk", "decay_every", "challenge_every", "ray_workers")
+        self._check_at_least(0, "warmup")
         self._check_at_least(2, "challenge_instances")
         self._check_at_least(2 if self.baseline == "shared" else 1, "samples")
         self._check_positive("learning_rate", "decay")
