@@ -39,7 +39,7 @@ class ArrayField:
         low_allowed: whether ``low`` itself is allowed.
         high: greatest value; infinity is allowed only if this is ``math.inf``.
         zero_at_depot: whether entry 0 must be 0.
-        check: a further check of the array (..., *shape); returns what is wrong, or None.
+        check: a further check of the array ``(..., *shape)``; returns what is wrong, or None.
     """
 
     dtype: str
@@ -163,8 +163,8 @@ class Problem:
 
     Attributes:
         n_agents: m.
-        arrays: NumPy arrays or torch tensors (B, *shape) by their names in ``FIELDS``; ``nodes`` (B, n, 2) always, a
-            world's fields only if the instances have it.
+        arrays: NumPy arrays or torch tensors ``(B, *shape)`` by their names in ``FIELDS``; ``nodes`` (B, n, 2)
+            always, a world's fields only if the instances have it.
     """
 
     n_agents: int
@@ -206,7 +206,7 @@ def _shapes(instance: Instance) -> dict[str, Any]:
 
 
 def check_arrays(arrays: Mapping[str, np.ndarray], n_agents: int) -> None:
-    """Raise ValueError unless ``arrays`` (..., *shape), by name, describe problems for ``n_agents`` agents."""
+    """Raise ValueError unless ``arrays`` ``(..., *shape)``, by name, describe problems for ``n_agents`` agents."""
     for name in arrays:
         if name not in FIELDS:
             raise ValueError(f"unknown field {name!r}; choose from {list(FIELDS)}")

@@ -122,12 +122,15 @@ def test_imitation_with_muon_resumes_bit_for_bit(tmp_path, monkeypatch):
     def interrupted(self):
         logs = train_step(self)
         if self.step == 5:
-            signal.raise_signal(signal.SIGTERM)
+            signal.raise_signal(signal.SIGINT)
         return logs
 
     train_step = ImitationLearner.train_step
     monkeypatch.setattr(ImitationLearner, "train_step", interrupted)
-    assert imitate(replace(muon, out=tmp_path / "parts")).step == 5
+    with pytest.raises(KeyboardInterrupt):
+        imitate(replace(muon, out=tmp_path / "parts"))
+    monkeypatch.undo()
+    assert checkpoint.read(tmp_path / "parts" / "checkpoint.pt")["progress"]["step"] == 5
     assert imitate(replace(muon, out=tmp_path / "parts", resume=True)).step == 12
     whole, parts = (checkpoint.read(tmp_path / name / "checkpoint.pt") for name in ("whole", "parts"))
     for key in ("network", "average", "optimiser", "schedule", "buffer"):

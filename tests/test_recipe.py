@@ -138,7 +138,7 @@ def test_the_recipes_that_come_with_the_project_are_valid(path):
         ('command = "improve"', 'command = "improve"\nsteps = 3', "stage 4: unknown key 'steps'"),
         ("set_tokens = 100", "set_token = 100", r"\(first\): set_token: .*; ImitateConfig has no such option"),
         ("n_layers = 1", "layers = 1", r"\(first\): joint.layers: .*no such option"),
-        ("n_layers = 1", "n_layers = 0", r"\(first\): joint: n_layers must be a whole number of at least 1, got 0"),
+        ("n_layers = 1", "n_layers = 0", r"\(first\): joint: n_layers must be a whole number from 1 to 1000, got 0"),
         ("n_nodes = [6, 9]", "n_nodes = [6, 5]", r"\(first\): n_nodes\[1\] must be a whole number of at least 6"),
         ("n_nodes = [6, 9]", 'n_nodes = [6, "9"]', r"\(first\): n_nodes.1: .*valid integer"),
         ("tensorboard = false", "tensorboard = 0", r"\(first\): tensorboard: .*boolean"),
@@ -188,7 +188,7 @@ def test_an_interrupted_recipe_resumes_bit_for_bit(tiny, tmp_path, monkeypatch):
         def interrupted(self):
             logs = train_step(self)
             if self.config.out.name != "first" and self.step == 1:
-                signal.raise_signal(signal.SIGTERM)
+                signal.raise_signal(signal.SIGINT)
             return logs
 
         return interrupted
@@ -196,7 +196,8 @@ def test_an_interrupted_recipe_resumes_bit_for_bit(tiny, tmp_path, monkeypatch):
     for learner in (ImitationLearner, ReinforceLearner, ImproveLearner):
         monkeypatch.setattr(learner, "train_step", interrupting(learner.train_step))
     for number in (1, 2, 3):
-        recipe(tiny, parts, resume=number > 1)
+        with pytest.raises(KeyboardInterrupt):
+            recipe(tiny, parts, resume=number > 1)
         expected = ["complete"] * number + ["under way"] + ["waiting"] * (3 - number)
         assert [stage["status"] for stage in log_of(parts)["stages"]] == expected
         assert log_of(parts)["stages"][number]["steps"] == 1

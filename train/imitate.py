@@ -10,7 +10,7 @@ import tyro
 from dan_policy.registry import find
 from train.buffer import Buffer
 from train.config import ImitateConfig
-from train.loop import check_folder, run
+from train.loop import run, run_folder
 from train.network import observation_keys
 from train.supervised import SupervisedLearner
 
@@ -61,14 +61,15 @@ def imitate(config: Annotated[ImitateConfig, tyro.conf.arg(name="")]) -> Imitati
     Raises:
         FileExistsError: ``config.out`` holds another run and ``resume`` is not set.
         ModuleNotFoundError: Numba, which the teacher needs, is not installed.
-        ValueError: the run to resume had another configuration, or a value does not fit.
+        ValueError: the run to resume had another configuration, a value does not fit, or another process trains in
+            ``config.out``.
         OSError: there is no run to resume, or no such weights.
     """
     import mtsp_env.reference  # noqa: F401 (fail now if Numba is missing, not in a worker)
 
-    check_folder(config)
     if config.roll_in is not None:
         find(config.roll_in)  # fail now if there are no such weights
-    learner = ImitationLearner(config)
-    run(learner)
+    with run_folder(config):
+        learner = ImitationLearner(config)
+        run(learner)
     return learner

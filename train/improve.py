@@ -19,7 +19,7 @@ from mtsp_env.instance import Problem
 from train.collect import draw, play, repeat, rotated
 from train.config import ImproveConfig
 from train.demonstrations import Demonstrations, as_decisions, as_links
-from train.loop import check_folder, run
+from train.loop import run, run_folder
 from train.network import observation_keys
 from train.plans import PLAN_KEYS, add_plans
 from train.supervised import SupervisedLearner
@@ -87,10 +87,11 @@ def improve(config: Annotated[ImproveConfig, tyro.conf.arg(name="")]) -> Improve
 
     Raises:
         FileExistsError: ``config.out`` holds another run and ``resume`` is not set.
-        ValueError: the run to resume had another configuration, or a value does not fit.
+        ValueError: the run to resume had another configuration, a value does not fit, or another process trains in
+            ``config.out``.
         OSError: there is no run to resume, or no such weights.
     """
-    check_folder(config)
-    learner = ImproveLearner(config)
-    run(learner)
+    with run_folder(config):
+        learner = ImproveLearner(config)
+        run(learner)
     return learner

@@ -7,6 +7,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -20,7 +21,7 @@ from mtsp_env.files import atomic_write, write_json
 from train import checkpoint
 from train.config import ImitateConfig, RunConfig
 from train.learner import Learner, checkpoint_path
-from train.loop import run
+from train.loop import run, run_folder
 from train.recipe import COMMANDS, PREVIOUS, Stage, read_recipe
 
 LOG = "log.json"
@@ -191,24 +192,23 @@ def _train(stage: Stage, config: RunConfig, record: Record, left: float, write_l
     seconds = min(left, max(budget - spent, 0.0))
     config = replace(config, resume=resume, seconds=seconds if 0 < seconds < math.inf else None)
     print(f"stage {stage.name}: {'continues' if resume else f'starts from {config.init}'}", file=sys.stderr, flush=True)
-    learner = COMMANDS[stage.command].learner(config)
-    record.status = "under way"
-    write_log()
-
-    if spent < budget:
-        run(learner)
-    else:  # it was stopped after its last step, before it was recorded as complete
+    with run_folder(config):
+        learner = COMMANDS[stage.command].learner(config)
+        record.status = "under way"
+        write_log()
         try:
-            learner.restore()
-        finally:
-            learner.close()
-    complete = learner.step >= config.steps or learner.seconds >= budget
-    if complete:
-        record.validation_cost = learner.validate()  # the last weights may be the best
-        learner.save()
-        record.status, record.weights = "complete", f"{stage.name}/best.safetensors"
-    _update(record, learner)
-    write_log()
+            if spent < budget:
+                run(learner)
+            else:  # it was stopped after its last step, before it was recorded as complete
+                with closing(learner):
+                    learner.restore()
+            if learner.step >= config.steps or learner.seconds >= budget:
+                record.validation_cost = learner.validate()  # the last weights may be the best
+                learner.save()
+                record.status, record.weights = "complete", f"{stage.name}/best.safetensors"
+        finally:  # also if a signal ends the process, which `run` lets pass once everything is saved
+            _update(record, learner)
+            write_log()
     print(f"stage {stage.name}: {_summary(record)}", file=sys.stderr, flush=True)
 
 

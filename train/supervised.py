@@ -50,17 +50,14 @@ class SupervisedLearner(Learner):
                 losses = imitation_losses(self.network, decisions, config)
             (share * losses.total).backward()
             logged += torch.stack(losses[1:]).detach() * torch.tensor([share, share, share, 1.0], device=config.device)
-        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.max_grad_norm)
-        self.optimiser.step()
-        self.schedule.step()
-        self.average.update_parameters(self.network)
+        norm = self.update()
         loss, next_loss, assignment_loss, agreed = logged.tolist()
         return {
             "loss": loss,
             "next_loss": next_loss,
             "assignment_loss": assignment_loss,
             "agreement": agreed / sum(map(len, batches)),
-            "grad_norm": float(norm),
+            "grad_norm": norm,
             "learning_rate": float(self.schedule.get_last_lr()[0]),
         }
 
