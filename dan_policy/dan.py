@@ -10,7 +10,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from dan_policy.layers import AttentionLayer, Norm, check_clip, check_sizes, masked_mean, open_nodes
+from dan_policy.layers import (
+    AttentionLayer,
+    DenseLogits,
+    Norm,
+    check_clip,
+    check_sizes,
+    masked_mean,
+    open_nodes,
+    pointer_logits,
+    scatter_nodes,
+)
 
 
 @dataclass(frozen=True)
@@ -34,6 +44,7 @@ class DANConfig:
     tanh_clip: float = 10.0  # C: logits lie in [-C, C]
     prune_visited: bool = False  # drop visited cities before the encoders: faster, not in the paper
     view: int | None = None  # with prune_visited: see at most this many cities, the nearest unvisited ones
+    assignment: bool = False  # also predict which agent visits each city, for dense supervision; not in the paper
 
     def __post_init__(self) -> None:
         check_sizes(self, "embed_dim", "feedforward_dim", "n_heads", "city_layers")
@@ -86,6 +97,14 @@ class DAN(nn.Module):
         self.glimpse_layer = layer(config.decoder_norm)
         self.pointer_query = nn.Linear(config.embed_dim, config.embed_dim, bias=False)
         self.pointer_key = nn.Linear(config.embed_dim, config.embed_dim, bias=False)
+        if config.assignment:
+            self.assignment_query = nn.Linear(config.embed_dim, config.embed_dim, bias=False)
+            self.assignment_key = nn.Linear(config.embed_dim, config.embed_dim, bias=False)
+
+    @property
+    def dense_outputs(self) -> tuple[str, ...]:
+        """What ``forward_dense`` returns besides the policy."""
+        return ("assignment",) if self.config.assignment else ()
 
     def forward(self, cities: Tensor, agents: Tensor, visited: Tensor) -> Tensor:
         """Logits over the nodes for one observation per row. Any number of leading dimensions is fine.
@@ -98,24 +117,40 @@ class DAN(nn.Module):
         Returns:
             (..., n) float, in [-C, C]; -C out of view. A visited node's logit means nothing: the actor masks it.
         """
-        lead, n = cities.shape[:-2], cities.shape[-2]
+        policy, *_ = self._decide(cities, agents, visited)
+        return policy.reshape(visited.shape)
+
+    def forward_dense(self, cities: Tensor, agents: Tensor, visited: Tensor) -> DenseLogits:
+        """Logits of the policy and, with ``config.assignment``, of each city's visitor; arguments as in ``forward``.
+
+        The visitors are read from the city-agent embeddings, which are meant to predict who may take which city (Sec.
+        5, City-agent Encoder). They are 0 at visited nodes and out of view.
+        """
+        policy, h_a, h_ca, in_view = self._decide(cities, agents, visited)
+        policy = policy.reshape(visited.shape)
+        if not self.config.assignment:
+            return DenseLogits(policy, None, None)
+        scores = pointer_logits(self.assignment_query(h_a), self.assignment_key(h_ca))  # (B, m, k)
+        assignment = scatter_nodes(scores, in_view, visited.reshape(-1, visited.shape[-1]), 0.0)  # (B, m, n)
+        return DenseLogits(policy, None, assignment.reshape(*agents.shape[:-1], visited.shape[-1]))
+
+    def _decide(self, cities: Tensor, agents: Tensor, visited: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Logits (B, n), embeddings of agents (B, m, d) and of nodes in view (B, k, d), and those nodes (B, k)."""
+        n = cities.shape[-2]
         cities, visited = cities.reshape(-1, n, 2), visited.reshape(-1, n)
         agents = agents.reshape(-1, *agents.shape[-2:])
-        if self.config.prune_visited:
-            logits = self._pruned_logits(cities, agents, visited)
-        else:
-            logits = self._logits(cities, agents, real=None, unvisited=~visited)
-        return logits.reshape(*lead, n)
-
-    def _pruned_logits(self, cities: Tensor, agents: Tensor, visited: Tensor) -> Tensor:
-        """Gathers each row's nodes in view, and scatters their logits back."""
+        if not self.config.prune_visited:
+            logits, h_a, h_ca = self._logits(cities, agents, real=None, unvisited=~visited)
+            return logits, h_a, h_ca, torch.arange(n, device=visited.device).expand_as(visited)
         in_view, real = open_nodes(cities, visited, self.config.view)  # (B, k)
         seen = cities.gather(1, in_view[:, :, None].expand(-1, -1, 2))  # (B, k, 2)
-        logits = self._logits(seen, agents, real, unvisited=real)
-        return logits.new_full(visited.shape, -self.config.tanh_clip).scatter(1, in_view, logits)
+        logits, h_a, h_ca = self._logits(seen, agents, real, unvisited=real)
+        return logits.new_full(visited.shape, -self.config.tanh_clip).scatter(1, in_view, logits), h_a, h_ca, in_view
 
-    def _logits(self, cities: Tensor, agents: Tensor, real: Tensor | None, unvisited: Tensor | None) -> Tensor:
-        """cities (B, k, 2), agents (B, m, 3) -> (B, k).
+    def _logits(
+        self, cities: Tensor, agents: Tensor, real: Tensor | None, unvisited: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """cities (B, k, 2), agents (B, m, 3) -> logits (B, k), embeddings of agents (B, m, d) and nodes (B, k, d).
 
         ``real`` (B, k) is False at padding, ``unvisited`` (B, k) at what may not be picked; None if there is neither.
         """
@@ -139,4 +174,4 @@ class DAN(nn.Module):
         q, k = self.pointer_query(h_f), self.pointer_key(h_ca)
         u = (q @ k.transpose(1, 2))[:, 0] / self.config.embed_dim**0.5  # (B, k)
         u = u.to(torch.promote_types(u.dtype, torch.float32))  # bfloat16 is too coarse for probabilities
-        return self.config.tanh_clip * torch.tanh(u)
+        return self.config.tanh_clip * torch.tanh(u), h_a, h_ca

@@ -10,12 +10,19 @@ This module knows no environment: it takes tensors and returns tensors.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from dan_policy.layers import AttentionLayer, check_clip, check_sizes, open_nodes
+from dan_policy.layers import (
+    AttentionLayer,
+    DenseLogits,
+    check_clip,
+    check_sizes,
+    open_nodes,
+    pointer_logits,
+    scatter_nodes,
+)
 
 
 @dataclass(frozen=True)
@@ -43,22 +50,12 @@ class JointConfig:
             raise ValueError(f"view must be None or at least 1 city, got {self.view!r}")
 
 
-class DenseLogits(NamedTuple):
-    """Logits of the policy and, for dense supervision, of what all agents do. None: the network has no such output.
-
-    Leading dimensions are those of the observation.
-    """
-
-    policy: Tensor  # (..., n) logits over the nodes: where the deciding agent goes next
-    next: Tensor | None  # (..., m, n) logits over the nodes: where each agent goes next
-    assignment: Tensor | None  # (..., m, n) logits over the agents: which of them visits each city
-
-
 class JointDAN(nn.Module):
     """One pre-norm transformer over all tokens, then a single-head pointer from each agent to the nodes."""
 
     in_keys = ("cities", "agents", "visited", "agent")
     supports_bfloat16 = True  # trained and tested under autocast: logits stay float32
+    dense_outputs = ("next", "assignment")
 
     def __init__(self, config: JointConfig | None = None):
         super().__init__()
@@ -94,7 +91,7 @@ class JointDAN(nn.Module):
         h_agents, h_nodes, in_view = self._encode(cities, agents, visited, agent)
         h_decider = _gather(h_agents, agent[:, None])  # (B, 1, d)
         logits = self._next(h_decider, h_nodes)  # (B, 1, k)
-        return _scatter(logits, in_view, visited, -self.config.tanh_clip).reshape(*lead, n)
+        return scatter_nodes(logits, in_view, visited, -self.config.tanh_clip).reshape(*lead, n)
 
     def forward_dense(self, cities: Tensor, agents: Tensor, visited: Tensor, agent: Tensor) -> DenseLogits:
         """Logits of the policy, of all agents' next nodes and of each city's visitor; arguments as in ``forward``.
@@ -106,9 +103,9 @@ class JointDAN(nn.Module):
         cities, agents, visited, agent = _rows(cities, agents, visited, agent)
         h_agents, h_nodes, in_view = self._encode(cities, agents, visited, agent)
         next_logits = self._next(h_agents, h_nodes)  # (B, m, k)
-        assignment = _products(self.assignment_query(h_agents), self.assignment_key(h_nodes))  # (B, m, k)
-        next_logits = _scatter(next_logits, in_view, visited, -self.config.tanh_clip)  # (B, m, n)
-        assignment = _scatter(assignment, in_view, visited, 0.0)  # (B, m, n)
+        assignment = pointer_logits(self.assignment_query(h_agents), self.assignment_key(h_nodes))  # (B, m, k)
+        next_logits = scatter_nodes(next_logits, in_view, visited, -self.config.tanh_clip)  # (B, m, n)
+        assignment = scatter_nodes(assignment, in_view, visited, 0.0)  # (B, m, n)
         policy = _gather(next_logits, agent[:, None])  # (B, 1, n)
         return DenseLogits(policy.reshape(*lead, n), next_logits.reshape(*lead, m, n), assignment.reshape(*lead, m, n))
 
@@ -128,13 +125,7 @@ class JointDAN(nn.Module):
 
     def _next(self, h_agents: Tensor, h_nodes: Tensor) -> Tensor:
         """(B, m, d), (B, k, d) -> (B, m, k) logits in [-C, C]."""
-        return self.config.tanh_clip * torch.tanh(_products(self.next_query(h_agents), self.next_key(h_nodes)))
-
-
-def _products(query: Tensor, key: Tensor) -> Tensor:
-    """q.k / sqrt(d) of (B, m, d) and (B, k, d) -> (B, m, k), at least float32: bfloat16 is too coarse for logits."""
-    u = (query @ key.transpose(1, 2)) / query.shape[-1] ** 0.5
-    return u.to(torch.promote_types(u.dtype, torch.float32))
+        return self.config.tanh_clip * torch.tanh(pointer_logits(self.next_query(h_agents), self.next_key(h_nodes)))
 
 
 def _rows(cities: Tensor, agents: Tensor, visited: Tensor, agent: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -146,10 +137,3 @@ def _rows(cities: Tensor, agents: Tensor, visited: Tensor, agent: Tensor) -> tup
 def _gather(h: Tensor, indices: Tensor) -> Tensor:
     """Entries ``indices`` (B, k) of h (B, n, d) -> (B, k, d)."""
     return h.gather(1, indices[:, :, None].expand(-1, -1, h.shape[2]))
-
-
-def _scatter(logits: Tensor, in_view: Tensor, visited: Tensor, fill: float) -> Tensor:
-    """Put logits (B, m, k) at their nodes ``in_view`` (B, k) -> (B, m, n), with ``fill`` at visited and other nodes."""
-    shape = (*logits.shape[:2], visited.shape[1])
-    whole = logits.new_full(shape, fill).scatter(2, in_view[:, None].expand(-1, logits.shape[1], -1), logits)
-    return whole.masked_fill(visited[:, None], fill)

@@ -1,8 +1,9 @@
-"""Building blocks that the networks share: the attention layer of the paper, and the choice of nodes to encode."""
+"""Building blocks that the networks share: the attention layer of the paper, the choice of nodes to encode, and dense
+outputs."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -29,6 +30,18 @@ def check_clip(value: float) -> None:
     """Raise ValueError unless ``value`` can be the tanh_clip of a network."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value <= GREATEST_CLIP:
         raise ValueError(f"tanh_clip must be a number above 0 and at most {GREATEST_CLIP:g}, got {value!r}")
+
+
+class DenseLogits(NamedTuple):
+    """Logits of the policy and, for dense supervision, of what all agents do. None: the network has no such output.
+
+    Leading dimensions are those of the observation. A network that returns them from ``forward_dense``, with the
+    arguments of ``forward``, names its outputs besides ``policy`` in ``dense_outputs``.
+    """
+
+    policy: Tensor  # (..., n) logits over the nodes: where the deciding agent goes next
+    next: Tensor | None  # (..., m, n) logits over the nodes: where each agent goes next
+    assignment: Tensor | None  # (..., m, n) logits over the agents: which of them visits each city
 
 
 class AttentionLayer(nn.Module):
@@ -131,3 +144,16 @@ def padded_length(length: int) -> int:
     """
     step = max(8, 1 << (length - 1).bit_length() >> 4)
     return -(-length // step) * step
+
+
+def pointer_logits(query: Tensor, key: Tensor) -> Tensor:
+    """q.k / sqrt(d) of (B, m, d) and (B, k, d) -> (B, m, k), at least float32: bfloat16 is too coarse for logits."""
+    u = (query @ key.transpose(1, 2)) / query.shape[-1] ** 0.5
+    return u.to(torch.promote_types(u.dtype, torch.float32))
+
+
+def scatter_nodes(logits: Tensor, in_view: Tensor, visited: Tensor, fill: float) -> Tensor:
+    """Put logits (B, m, k) at their nodes ``in_view`` (B, k) -> (B, m, n), with ``fill`` at visited and other nodes."""
+    shape = (*logits.shape[:2], visited.shape[1])
+    whole = logits.new_full(shape, fill).scatter(2, in_view[:, None].expand(-1, logits.shape[1], -1), logits)
+    return whole.masked_fill(visited[:, None], fill)

@@ -202,3 +202,43 @@ def test_a_view_of_all_cities_hides_none():
     wide = DAN(replace(SMALL, prune_visited=True, view=8))
     wide.load_state_dict(everything.state_dict())
     assert torch.equal(wide(cities, agents, visited), everything(cities, agents, visited))
+
+
+def test_the_assignment_is_off_by_default_and_leaves_the_policy_alone():
+    torch.manual_seed(0)
+    plain = DAN(SMALL)
+    dense = DAN(replace(SMALL, assignment=True))
+    added = dense.state_dict().keys() - plain.state_dict().keys()
+    assert added == {"assignment_query.weight", "assignment_key.weight"}
+    assert plain.dense_outputs == () and dense.dense_outputs == ("assignment",)
+    dense.load_state_dict(plain.state_dict(), strict=False)
+    cities, agents, visited = observation()
+    logits = plain(cities, agents, visited)
+    assert torch.equal(dense(cities, agents, visited), logits)
+    assert torch.equal(dense.forward_dense(cities, agents, visited).policy, logits)
+    none = plain.forward_dense(cities, agents, visited)
+    assert torch.equal(none.policy, logits) and none.next is none.assignment is None
+
+
+@pytest.mark.parametrize("prune", [False, True])
+def test_permuting_agents_and_cities_permutes_the_assignment(prune):
+    torch.manual_seed(0)
+    network = DAN(replace(SMALL, assignment=True, prune_visited=prune)).double()
+    cities, agents, visited = observation(dtype=torch.float64)
+    assignment = network.forward_dense(cities, agents, visited).assignment  # (B, m, n)
+    assert assignment.shape == (5, 4, 9) and (assignment[visited[:, None].expand_as(assignment)] == 0).all()
+    others, order = torch.tensor([2, 0, 3, 1]), torch.tensor([0, 4, 2, 8, 1, 3, 7, 5, 6])
+    permuted = network.forward_dense(cities[:, order], agents[:, others], visited[:, order]).assignment
+    assert torch.allclose(permuted, assignment[:, others][:, :, order], atol=1e-10)
+    assert not torch.allclose(assignment[:, 0], assignment[:, 1])
+    leading = [one.unflatten(0, (5, 1)) for one in (cities, agents, visited)]
+    assert torch.equal(network.forward_dense(*leading).assignment[:, 0], assignment)
+
+
+def test_the_assignments_gradients_reach_its_parameters_and_the_encoders():
+    torch.manual_seed(0)
+    network = DAN(replace(SMALL, assignment=True, prune_visited=True))
+    network.forward_dense(*observation()).assignment.square().sum().backward()
+    reached = {name for name, parameter in network.named_parameters() if parameter.grad is not None}
+    assert {"assignment_query.weight", "assignment_key.weight", "embed_city.weight", "embed_agent.weight"} <= reached
+    assert "pointer_key.weight" not in reached

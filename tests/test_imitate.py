@@ -22,7 +22,8 @@ from train.buffer import Buffer
 from train.collect import costs, environment, play
 from train.config import ImitateConfig
 from train.demonstrations import Demonstrations, as_decisions, as_links, canonical, demonstrate, follow
-from train.imitate import ImitationLearner, imitate, rate
+from train.imitate import ImitationLearner, imitate
+from train.supervised import rate
 
 pytest.importorskip("numba", reason="the teacher is compiled with Numba")
 

@@ -8,43 +8,26 @@ import numpy as np
 import pytest
 import torch
 from helpers.states import same
+from tiny import TINY_PLANS as TINY
 
 from dan_policy.dan import DAN, DANConfig
-from dan_policy.joint import DenseLogits, JointConfig, JointDAN
+from dan_policy.joint import JointDAN
+from dan_policy.layers import DenseLogits
 from dan_policy.registry import load
 from mtsp_env.instance import Problem
 from train import checkpoint
 from train.baseline import better
 from train.buffer import Buffer
 from train.collect import costs
-from train.config import ImitateConfig
 from train.demonstrations import Demonstrations, as_decisions, as_links, demonstrate
-from train.imitate import ImitationLearner, imitate, imitation_losses, learns_plans, rate
+from train.imitate import ImitationLearner, imitate
 from train.network import observation_keys
 from train.plans import PLAN_KEYS, add_plans, plan_losses, visitors
+from train.supervised import imitation_losses, learns_plans, rate
 
 pytest.importorskip("numba", reason="the teacher is compiled with Numba")
 
-JOINT = JointConfig(embed_dim=16, feedforward_dim=32, n_heads=2, n_layers=1)
-TINY = ImitateConfig(
-    policy="joint",
-    joint=JOINT,
-    n_nodes=(6, 9),
-    n_agents=(1, 3),
-    nodes_per_agent=2,
-    set_tokens=100,
-    buffer=3,
-    sets_per_step=2,
-    workers=0,
-    teacher_iterations=20,
-    warmup=2,
-    steps=12,
-    average=0.5,
-    validate_every=4,
-    validation_instances=8,
-    checkpoint_every=4,
-    tensorboard=False,
-)
+JOINT = TINY.joint
 KEYS = ("cities", "agents", "visited", "agent", "action_mask", ("game", "destination"))
 
 
@@ -125,16 +108,26 @@ def test_the_policys_loss_is_the_same_with_and_without_plans(decisions):
     torch.manual_seed(0)
     network = JointDAN(JOINT)
     with torch.no_grad():
-        dense, plain = imitation_losses(network, decisions), imitation_losses(network, decisions.exclude("plan"))
+        dense, plain = (imitation_losses(network, part, TINY) for part in (decisions, decisions.exclude("plan")))
     assert float(dense.loss) == pytest.approx(float(plain.loss), rel=1e-5) and dense.agreed == plain.agreed
     assert dense.next > 0 and dense.assignment > 0 and plain.next == plain.assignment == 0
+
+
+def test_dan_learns_who_visits_each_city():
+    dan = DANConfig(embed_dim=16, feedforward_dim=32, n_heads=2, city_layers=1, prune_visited=True, assignment=True)
+    learner = ImitationLearner(replace(TINY, policy="dan", network=dan, learning_rate=1e-2))
+    logs = [learner.train_step() for _ in range(12)]
+    assert all(log["next_loss"] == 0.0 for log in logs)
+    assert 0 < logs[-1]["assignment_loss"] < logs[0]["assignment_loss"]
 
 
 def test_weights_of_zero_and_networks_without_the_outputs_need_no_plans():
     joint, dan = JointDAN(JOINT), DAN(DANConfig(embed_dim=16, feedforward_dim=32, n_heads=2))
     off = replace(TINY, next_weight=0.0, assignment_weight=0.0)
     assert learns_plans(joint, TINY) and not learns_plans(joint, off) and not learns_plans(dan, TINY)
-    for network, config in ((joint, TINY), (joint, off), (dan, TINY)):
+    dense_dan = DAN(replace(dan.config, assignment=True))
+    assert learns_plans(dense_dan, TINY) and not learns_plans(dense_dan, replace(TINY, assignment_weight=0.0))
+    for network, config in ((joint, TINY), (joint, off), (dan, TINY), (dense_dan, TINY)):
         plans = learns_plans(network, config)
         keys = observation_keys(network)
         batch = Buffer(config, keys, np.random.default_rng(0), plans).draw(1)[0]
@@ -148,12 +141,14 @@ def test_resume_is_bit_identical(tmp_path, monkeypatch):
     def interrupted(self):
         logs = train_step(self)
         if self.step == 5:
-            signal.raise_signal(signal.SIGTERM)
+            signal.raise_signal(signal.SIGINT)
         return logs
 
     train_step = ImitationLearner.train_step
     monkeypatch.setattr(ImitationLearner, "train_step", interrupted)
-    assert imitate(replace(TINY, out=tmp_path / "parts")).step == 5
+    with pytest.raises(KeyboardInterrupt):
+        imitate(replace(TINY, out=tmp_path / "parts"))
+    assert checkpoint.read(tmp_path / "parts" / "checkpoint.pt")["progress"]["step"] == 5
     assert imitate(replace(TINY, out=tmp_path / "parts", resume=True)).step == 12
     whole, parts = (checkpoint.read(tmp_path / name / "checkpoint.pt") for name in ("whole", "parts"))
     for key in ("network", "average", "optimiser", "schedule", "buffer"):
@@ -187,5 +182,5 @@ def test_the_learning_rate_may_follow_the_clock():
 
 @pytest.mark.parametrize("name", ["next_weight", "assignment_weight"])
 def test_negative_weights_are_refused(name):
-    with pytest.raises(ValueError, match=f"{name} must be at least 0, got -0.5"):
+    with pytest.raises(ValueError, match=f"{name} must be finite and at least 0, got -0.5"):
         replace(TINY, **{name: -0.5})

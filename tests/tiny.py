@@ -1,8 +1,9 @@
-"""The options of a training run that takes a second."""
+"""The options of training runs that take a second."""
 
 from dataclasses import replace
 
-from dan_policy import DANConfig
+from dan_policy import DANConfig, JointConfig
+from train.config import ImitateConfig
 from train.presets import QUICK
 
 TINY = replace(
@@ -19,5 +20,25 @@ TINY = replace(
     decay=0.5,
     decay_every=2,
     steps=6,
+    tensorboard=False,
+)
+
+TINY_PLANS = ImitateConfig(
+    policy="joint",
+    joint=JointConfig(embed_dim=16, feedforward_dim=32, n_heads=2, n_layers=1),
+    n_nodes=(6, 9),
+    n_agents=(1, 3),
+    nodes_per_agent=2,
+    set_tokens=100,
+    buffer=3,
+    sets_per_step=2,
+    workers=0,
+    teacher_iterations=20,
+    warmup=2,
+    steps=12,
+    average=0.5,
+    validate_every=4,
+    validation_instances=8,
+    checkpoint_every=4,
     tensorboard=False,
 )

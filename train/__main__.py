@@ -1,4 +1,4 @@
-"""``python -m train imitate [options]``, ``reinforce {paper,refine,quick} [options]``, ``average``, ``validate``."""
+"""``python -m train {recipe, imitate, reinforce, improve, average, validate} [options]``."""
 
 from __future__ import annotations
 
@@ -20,11 +20,13 @@ import tyro
 
 from train.average import average
 from train.imitate import imitate
+from train.improve import improve
 from train.reinforce import reinforce
+from train.stages import recipe
 from train.validate import validate
 
 app = tyro.extras.SubcommandApp()
-for command in (imitate, reinforce, average, validate):
+for command in (recipe, imitate, reinforce, improve, average, validate):
     app.command(command)
 
 

@@ -48,6 +48,22 @@ def draw(
     return Problem(n_agents, {name: torch.as_tensor(array, device=config.device) for name, array in arrays.items()})
 
 
+def rotated(rng: np.random.Generator, problem: Problem) -> Problem:
+    """The problem with each instance turned by a random angle about the middle of the unit square.
+
+    An instance some of whose nodes would leave the square is scaled down until they lie on its edge, by at most
+    sqrt(2).
+    """
+    middle = 0.5
+    nodes = torch.as_tensor(problem.nodes) - middle
+    angle = torch.as_tensor(rng.uniform(0, 2 * np.pi, len(nodes)), device=nodes.device)
+    cos, sin = angle.cos(), angle.sin()
+    turns = torch.stack([torch.stack([cos, sin], 1), torch.stack([-sin, cos], 1)], 1)  # (B, 2, 2), for row vectors
+    turned = nodes @ turns
+    turned = turned * (middle / turned.abs().amax((1, 2), keepdim=True)).clamp(max=1.0)
+    return Problem(problem.n_agents, {**problem.arrays, "nodes": (turned + middle).clamp(0, 1)})
+
+
 def repeat(problem: Problem, samples: int) -> Problem:
     """Each instance ``samples`` times in succession, going through the eight symmetries of the square."""
     if samples == 1:

@@ -25,8 +25,8 @@ from mtsp_env import rules
 from mtsp_env.distributions import sample
 from mtsp_env.instance import Problem, Tours, check_plain
 from mtsp_env.tours import is_closed
-from train.collect import autocast, draw_size, environment
-from train.config import ImitateConfig
+from train.collect import autocast, draw_size, environment, rotated
+from train.config import ImitateConfig, SupervisedConfig
 from train.network import load_student
 
 
@@ -49,6 +49,9 @@ def demonstrate(config: ImitateConfig, index: int) -> Demonstrations:
     batch = 1 << batch.bit_length() - 1  # few different shapes, so that oneDNN builds few kernels
     problem = sample(config.generator(), rng, batch, n_nodes, n_agents)
     check_plain(problem)  # the teacher solves plain problems only
+    if config.rotate:
+        turned = rotated(rng, problem)
+        problem = Problem(n_agents, {name: np.asarray(array) for name, array in turned.arrays.items()})
     nodes = problem.nodes
     seed = int(rng.integers(2**31))
     begin = 0 if config.roll_in is None else int(rng.integers(n_nodes - 1))  # every game takes n - 1 decisions or more
@@ -136,7 +139,7 @@ def follow(demonstrations: Demonstrations, device: torch.device | str = "cpu") -
 
 
 def as_decisions(
-    demonstrations: Demonstrations, keys: Sequence[Key], config: ImitateConfig
+    demonstrations: Demonstrations, keys: Sequence[Key], config: SupervisedConfig
 ) -> tuple[TensorDictBase, Tensor]:
     """Turn the teacher's tours into decisions, in the order of the environment's clock.
 

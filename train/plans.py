@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from scipy.optimize import linear_sum_assignment
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torch.nn import functional
 
 from dan_policy.actor import Key
-from dan_policy.joint import DenseLogits
+from dan_policy.layers import DenseLogits
 from train.demonstrations import Demonstrations
 
 PLAN_KEYS: tuple[Key, ...] = ("visited", "agent", ("game", "destination"))
@@ -75,17 +77,100 @@ def plan_losses(logits: DenseLogits, decisions: TensorDictBase) -> tuple[Tensor,
         The mean over the next nodes of all agents except the deciding ones, and the mean over the visitors of all
         unvisited cities; () each, 0 if there are none or if the network has no such output.
     """
-    plan, visited = decisions["plan"], decisions["visited"]
+    plan = decisions["plan"]
     next_loss = assignment_loss = logits.policy.new_zeros(())
     if logits.next is not None:
-        deciding = torch.arange(logits.next.shape[1], device=visited.device) == decisions["agent"][:, None]  # (N, m)
-        log_prob = logits.next.masked_fill(visited[:, None], -torch.inf).log_softmax(2)  # (N, m, n)
-        log_prob = log_prob.gather(2, plan["next"][:, :, None])[:, :, 0][~deciding & ~plan["closed"]]
+        log_prob = _next_log_probs(logits.next, decisions).gather(2, plan["next"][:, :, None])[:, :, 0]
+        log_prob = log_prob[~_deciding(decisions) & ~plan["closed"]]
         next_loss = -log_prob.sum() / max(1, len(log_prob))
     if logits.assignment is not None:
-        log_prob = logits.assignment.masked_fill(plan["closed"][:, :, None], -torch.inf).log_softmax(1)  # (N, m, n)
-        is_city = ~visited
-        is_city[:, 0] = False
-        log_prob = log_prob.gather(1, plan["visitor"][:, None])[:, 0][is_city]
+        log_prob = _visitor_log_probs(logits.assignment, decisions).gather(1, plan["visitor"][:, None])[:, 0]
+        log_prob = log_prob[_open_cities(decisions)]
         assignment_loss = -log_prob.sum() / max(1, len(log_prob))
     return next_loss, assignment_loss
+
+
+@torch.no_grad()
+def match_plans(
+    logits: DenseLogits, decisions: TensorDictBase, next_weight: float, assignment_weight: float
+) -> TensorDictBase:
+    """Exchange the tours of agents that have not left the depot so that the loss becomes as small as possible.
+
+    Such agents are alike, so a plan in which they exchange their tours is as good. Of all these plans, this chooses the
+    one that the network finds likeliest, as MACSIM's permutation-invariant loss does, by the Hungarian method. The
+    minimum is exact for the mean cross-entropy with the actions plus the weighted losses of ``plan_losses``.
+
+    Args:
+        logits: the network's outputs for N decisions.
+        decisions: TensorDict [N] with ``PLAN_KEYS``, ``action``, ``action_mask`` and ``plan``.
+        next_weight: weight of the other agents' next nodes in the loss.
+        assignment_weight: weight of the cities' visitors in the loss.
+
+    Returns:
+        Decisions with another ``action`` and ``plan`` if an exchange pays; ``decisions`` stays as it is.
+    """
+    plan, deciding = decisions["plan"], _deciding(decisions)
+    starting = (decisions["game", "destination"] == 0) & ~plan["closed"]  # (N, m)
+    rows = (starting.sum(1) > 1).nonzero()[:, 0]
+    if len(rows) == 0:
+        return decisions
+    cost = _costs_of_tours(logits, decisions, next_weight, assignment_weight)[rows].cpu().numpy()
+    takes = np.tile(np.arange(deciding.shape[1]), (len(decisions), 1))  # (N, m): whose tour each agent takes
+    for row, agents, matrix in zip(rows.tolist(), starting[rows].cpu().numpy(), cost, strict=True):
+        alike = np.flatnonzero(agents)
+        takes[row, alike] = alike[linear_sum_assignment(matrix[np.ix_(alike, alike)])[1]]
+
+    taken = torch.as_tensor(takes, device=decisions.device)
+    following = plan["next"].gather(1, taken)
+    visitor = taken.argsort(1).gather(1, plan["visitor"])
+    visitor[:, 0] = 0
+    matched = decisions.copy()
+    matched["action"] = following[deciding]
+    return matched.set("plan", plan.copy().update({"next": following, "visitor": visitor}))
+
+
+def _costs_of_tours(
+    logits: DenseLogits, decisions: TensorDictBase, next_weight: float, assignment_weight: float
+) -> Tensor:
+    """(N, m, m) What is added to the loss if agent a takes the tour that the plan gives to agent b."""
+    plan, deciding = decisions["plan"], _deciding(decisions)[:, :, None]  # (N, m, 1)
+    n_agents = plan["next"].shape[1]
+    policy = logits.policy.masked_fill(~decisions["action_mask"], -torch.inf).log_softmax(1)  # (N, n)
+    cost = -policy.gather(1, plan["next"])[:, None] / len(decisions)  # (N, 1, m)
+    if logits.next is None:
+        cost = cost.where(deciding, 0.0)
+    else:
+        count = (~_deciding(decisions) & ~plan["closed"]).sum().clamp(min=1)
+        labels = plan["next"][:, None].expand(-1, n_agents, -1)  # (N, m, m)
+        log_prob = _next_log_probs(logits.next, decisions).gather(2, labels)
+        cost = cost.where(deciding, -next_weight / count * log_prob)
+    if logits.assignment is not None:
+        cities = _open_cities(decisions)  # (N, n)
+        log_prob = _visitor_log_probs(logits.assignment, decisions).masked_fill(~cities[:, None], 0.0)
+        log_prob = log_prob.masked_fill(plan["closed"][:, :, None], 0.0)  # they take no part
+        visits = functional.one_hot(plan["visitor"], n_agents).to(log_prob.dtype)  # (N, n, m)
+        cost = cost - assignment_weight / cities.sum().clamp(min=1) * (log_prob @ visits)
+    return cost
+
+
+def _deciding(decisions: TensorDictBase) -> Tensor:
+    """(N, m) bool: True at the deciding agent."""
+    n_agents = decisions["game", "destination"].shape[1]
+    return torch.arange(n_agents, device=decisions.device) == decisions["agent"][:, None]
+
+
+def _open_cities(decisions: TensorDictBase) -> Tensor:
+    """(N, n) bool: the unvisited cities, without the depot."""
+    cities = ~decisions["visited"]
+    cities[:, 0] = False
+    return cities
+
+
+def _next_log_probs(logits: Tensor, decisions: TensorDictBase) -> Tensor:
+    """(N, m, n) Log-probabilities of every agent's next node."""
+    return logits.masked_fill(decisions["visited"][:, None], -torch.inf).log_softmax(2)
+
+
+def _visitor_log_probs(logits: Tensor, decisions: TensorDictBase) -> Tensor:
+    """(N, m, n) Log-probabilities, for every node, of the agents that have not closed their tours."""
+    return logits.masked_fill(decisions["plan", "closed"][:, :, None], -torch.inf).log_softmax(1)

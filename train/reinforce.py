@@ -6,6 +6,7 @@ import time
 from typing import Any
 
 import torch
+from torch.optim.lr_scheduler import ChainedScheduler, LinearLR, StepLR
 
 from dan_policy.actor import make_actor
 from dan_policy.episode import Episode
@@ -29,7 +30,7 @@ class ReinforceLearner(Learner):
     def __init__(self, config: ReinforceConfig):
         super().__init__(config)
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate)
-        self.schedule = torch.optim.lr_scheduler.StepLR(self.optimiser, config.decay_every, config.decay)
+        self.schedule = make_schedule(self.optimiser, config)
         if config.baseline == "shared":
             self.baseline: Baseline = SharedBaseline(config.samples)
         else:
@@ -91,6 +92,14 @@ class ReinforceLearner(Learner):
         """Restore what ``state_dict`` returned."""
         for part in ("optimiser", "schedule", "baseline"):
             getattr(self, part).load_state_dict(state[part])
+
+
+def make_schedule(optimiser: torch.optim.Optimizer, config: ReinforceConfig) -> StepLR | ChainedScheduler:
+    """The learning rate's decay, after a linear warm-up if there is one."""
+    decay = StepLR(optimiser, config.decay_every, config.decay)
+    if config.warmup < 2:  # the first step of a warm-up of 1 step has the whole rate already
+        return decay
+    return ChainedScheduler([LinearLR(optimiser, 1 / config.warmup, total_iters=config.warmup - 1), decay])
 
 
 def reinforce(config: Preset) -> ReinforceLearner:
