@@ -239,3 +239,16 @@ def rounded_length(instance: Instance, tours: Tours) -> int:
     """
     lengths = (np.linalg.norm(np.diff(instance.nodes[tour], axis=0), axis=1) * instance.scale for tour in tours)
     return max(int(np.floor(legs + 0.5).sum()) for legs in lengths)
+
+
+def rounded_bound(instance: Instance) -> int:
+    """A lower bound on ``rounded_length``: twice the length of the shortest path from the depot to the farthest city.
+
+    That path may be shorter than the direct leg, because rounded legs break the triangle inequality.
+    """
+    legs = np.linalg.norm(instance.nodes[:, None] - instance.nodes, axis=-1) * instance.scale
+    legs = np.floor(legs + 0.5)  # (n, n)
+    paths = legs[0]
+    while (shorter := (paths[:, None] + legs).min(0)).sum() < paths.sum():  # legs[i, i] is 0: no path becomes longer
+        paths = shorter
+    return 2 * int(paths.max())

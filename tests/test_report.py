@@ -17,7 +17,7 @@ from benchmarks.reports.markdown import markdown_table
 from benchmarks.reports.report import report
 from benchmarks.reports.tables import BOUND
 from benchmarks.solvers import SOLVERS
-from mtsp_env import makespan
+from mtsp_env import Instance, makespan
 
 INSTANCES = suite.cells("smoke")[0].instances(7)
 HALVES = [[0, 1, 2, 3, 0], [0, 4, 5, 6, 7, 0]]
@@ -148,6 +148,14 @@ def test_the_public_test_set_is_compared_with_published_numbers_of_the_same_inst
     assert (tmp_path / "report" / "gaps-seed3333.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_the_bound_of_rounded_legs_takes_the_shortest_path():
+    """The depot, a city at a distance of 2.8 (rounded: 3) and one half-way, at 1.4 from both (rounded: 1 and 1)."""
+    instance = Instance([[0.0, 0.0], [1.0, 0.0], [0.5, 0.0]], 1, scale=2.8)
+    assert suite.rounded_bound(instance) == 2 * (1 + 1) < suite.rounded_length(instance, [[0, 1, 0]]) == 6
+    assert suite.rounded_bound(instance) == suite.rounded_length(instance, [[0, 2, 1, 2, 0]])
+    assert statistics.bound(instance) == (2.0, 5.6, 4)
+
+
 def test_failures_are_counted_in_notes(tmp_path):
     good, bad = measured("reference", HALVES, budget=1.0), measured("lkh3", HALVES, budget=1.0)
     late = failed(bad[0], "timeout", "killed 10 s after its limit of 1 s")
@@ -259,7 +267,7 @@ def test_table_3_has_both_lengths_and_names_the_mix_up(tmp_path):
     assert line_of(text, "Longest tour, not rounded", BOUND) == ["-"]  # the file was not given
     farthest = np.linalg.norm(xy - xy[0], axis=1).max()
     text_with_file = report([path], tsplib=folder)
-    assert line_of(text_with_file, "Longest tour, every leg", BOUND) == [str(2 * int(farthest + 0.5))]
+    assert line_of(text_with_file, "Longest tour, every leg", BOUND) == [str(suite.rounded_bound(instance))]
     assert line_of(text_with_file, "Longest tour, not rounded", BOUND) == [f"{2 * farthest:.1f}"]
     assert "gtsp150, 10 (1)" in text and "under the name kroa150" in text and "For 1 of 1 instances the best" in text
     write(path, [replace(result, makespan=0.5)])

@@ -24,7 +24,7 @@ from benchmarks.suite import (
     TsplibCell,
     cells,
     find_cell,
-    rounded_length,
+    rounded_bound,
 )
 from mtsp_env.instance import Instance
 from mtsp_env.tours import check_tours, farthest_trip, makespan
@@ -60,7 +60,10 @@ class Comparison(NamedTuple):
 
 
 class Bound(NamedTuple):
-    """The trip from the depot to the farthest city and back, a lower bound on the makespan. Fields as in ``Row``."""
+    """The trip from the depot to the farthest city and back, a lower bound on the makespan. Fields as in ``Row``.
+
+    If legs are rounded, the trip takes the shortest path (``suite.rounded_bound``).
+    """
 
     makespan: float
     length: float
@@ -243,9 +246,8 @@ def _results(table: str, table_rows: Sequence[Row], tsplib: Path | None, folder:
 
 def bound(instance: Instance) -> Bound:
     """The lower bound of an instance."""
-    farthest = int(np.linalg.norm(instance.nodes - instance.nodes[0], axis=1).argmax())
     trip = farthest_trip(instance.nodes)
-    return Bound(trip, trip * instance.scale, rounded_length(instance, [[0, farthest, 0]]))
+    return Bound(trip, trip * instance.scale, rounded_bound(instance))
 
 
 def _include_kept(
