@@ -16,8 +16,10 @@ ENV_TESTS = [
     "tests/test_instance.py",
     "tests/test_regret.py",
     "tests/test_render.py",
+    "tests/test_single.py",
     "tests/test_tours.py",
     "tests/test_tsplib.py",
+    "tests/test_wrappers.py",
 ]
 DAN_TESTS = [
     *ENV_TESTS,

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ("mtsp_env", "dan_policy", "train", "benchmarks")  # each may import those before it
 FILES = sorted(file.relative_to(ROOT).as_posix() for package in PACKAGES for file in (ROOT / package).rglob("*.py"))
 
-FACES = ["mtsp_env.mtsp_v0", "mtsp_env.batched"]
+FACES = ["mtsp_env.mtsp_v0", "mtsp_env.batched", "mtsp_env.single", "mtsp_env.wrappers"]
 EXTRAS = ["mtsp_env.reference", "mtsp_env.render"]
 
 # What a file may not import, anywhere in it
@@ -49,8 +49,10 @@ LIGHT = [
     "machine",
     "mtsp_v0",
     "rules",
+    "single",
     "tours",
     "tsplib",
+    "wrappers",
 ]
 
 
