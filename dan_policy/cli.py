@@ -1,4 +1,4 @@
-"""The command ``mtsp``: solve instances from files, generate instances. Imports torch only to solve with a policy.
+"""The command ``mtsp``: solve and generate instances, serve. Imports torch only to solve with a policy.
 
 ``arguments.parse`` reads the signatures and docstrings of ``solve`` and ``generate``.
 """
@@ -19,6 +19,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from dan_policy.arguments import SECONDS, Positional, arg, default, parse, refuse, whole
+from dan_policy.serve import serve
 from mtsp_env import render
 from mtsp_env.distributions import sample
 from mtsp_env.files import read_instance, write_instance, write_tours
@@ -45,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"mtsp {__version__}")
         sys.exit(0)
     try:
-        command = parse([solve, generate], DESCRIPTION, argv)
+        command = parse([solve, generate, serve], DESCRIPTION, argv)
         command()
         sys.stdout.flush()
     except KeyboardInterrupt:

@@ -353,5 +353,5 @@ def test_version_and_help(capsys) -> None:
 
 
 def test_no_command_or_an_unknown_one(capsys) -> None:
-    assert "Expected one of {solve, generate}" in refused(capsys)
+    assert "Expected one of {solve, generate, serve}" in refused(capsys)
     assert "Unrecognized options: sovle" in refused(capsys, "sovle")
