@@ -27,8 +27,10 @@ lint: $(VENV)/.dev
 types: $(VENV)/.dev
 	$(BIN)/mypy
 
+# The source distribution and the wheel, and whether package indexes would show their descriptions.
 wheel: $(VENV)/.dev
-	$(BIN)/python -m build --wheel
+	$(BIN)/python -m build
+	$(BIN)/twine check --strict dist/*
 
 # torch goes first and alone: pip then takes a CPU build if it finds one, and the packages after it accept that build.
 $(VENV)/.demo: pyproject.toml constraints.txt

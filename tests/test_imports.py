@@ -41,6 +41,7 @@ FORBIDDEN = {
 NEEDS_AN_EXTRA = {"torch", "tensordict", "torchrl", "numba", "matplotlib", "vrplib"}
 LIGHT = [
     "__init__",
+    "__main__",
     "arrays",
     "checks",
     "distributions",
@@ -48,7 +49,10 @@ LIGHT = [
     "instance",
     "machine",
     "mtsp_v0",
+    "page",
+    "picture",
     "rules",
+    "schedule",
     "single",
     "tours",
     "tsplib",

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import json
+import multiprocessing
 import threading
 import time
 from collections import deque
+from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,7 @@ from command import refused  # noqa: E402
 
 from dan_policy.queueing import LEAST_SECONDS, Late, PlanQueue, fair_share  # noqa: E402
 from dan_policy.service import Limits, create_app  # noqa: E402
+from dan_policy.workers import Workers  # noqa: E402
 from mtsp_env import Instance, check_tours, reference  # noqa: E402
 
 LIMITS = Limits(nodes=60, agents=8, seconds=5.0, waiting=120, plans=1)
@@ -261,3 +264,22 @@ def test_bad_limits(change: dict, message: str) -> None:
 def test_bad_options_of_the_command(capsys: pytest.CaptureFixture) -> None:
     assert "--port: must be at most 65535, got 65536" in refused(capsys, "serve", "--port", "65536")
     assert "--max-nodes: must be a whole number of at least 2" in refused(capsys, "serve", "--max-nodes", "1")
+
+
+@pytest.mark.slow
+def test_workers_plan_in_processes_and_outlive_a_killed_one() -> None:
+    workers = Workers(1, policy=None)
+    instance = Instance(np.random.default_rng(0).random((12, 2)), 3)
+    try:
+        begun = [[0, 4], [0], [0]]
+        tours = workers(instance, "reference", 0.05, 0, begun)
+        check_tours(instance, tours)
+        assert tours[0][:2] == [0, 4]
+        [process] = [child for child in multiprocessing.active_children() if child.is_alive()]
+        process.kill()
+        process.join()
+        with pytest.raises(BrokenProcessPool):
+            workers(instance, "reference", 0.05, 0, None)
+        check_tours(instance, workers(instance, "reference", 0.05, 0, None))
+    finally:
+        workers.close()
