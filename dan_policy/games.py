@@ -15,7 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 
-from dan_policy.actor import Key, Network, network_keys
+from dan_policy.actor import Key, Network, check_greatest, network_keys
 from dan_policy.symmetry import views
 from mtsp_env import rules
 from mtsp_env.instance import Instance, Problem, Tours, batch
@@ -46,7 +46,7 @@ def begin(
     if augment:
         nodes = views(torch.tensor(instance.nodes), rows).numpy()  # (rows, n, 2)
         problem = Problem(problem.n_agents, {**problem.arrays, "nodes": nodes})
-    state, left = rules.start(problem), [list(prefix[1:]) for prefix in prefixes]
+    state, left = rules.start(problem, game), [list(prefix[1:]) for prefix in prefixes]
     while any(left):
         agent = min((a for a in range(len(left)) if left[a]), key=lambda a: (state.ready[0, a], a))
         action, *left[agent] = left[agent]
@@ -77,7 +77,7 @@ def play(
             an illegal action.
     """
     logits_of = _logits_of(policy)
-    while not rules.all_visited(state).all():
+    while not rules.terminated(state).all():
         seen = rules.observe(state, game)
         mask = torch.as_tensor(seen.action_mask)
         logits = logits_of(state, seen)
@@ -86,7 +86,8 @@ def play(
         logits = logits.masked_fill(~mask, -torch.inf)
         best, action = logits.max(1)  # (B,) each
         if not best.isfinite().all():
-            raise ValueError(f"the policy's logits must be finite for at least one legal node, got {float(best.min())}")
+            check_greatest(best)
+            raise ValueError("the policy's logits must be finite for at least one legal node, got -inf for all of them")
         if generator is not None:
             action = torch.multinomial(logits.float().softmax(1), 1, generator=generator)[:, 0]
         state = rules.depart(state, game, action.numpy() if isinstance(state.ready, np.ndarray) else action)
@@ -129,7 +130,7 @@ def _tensor(state: rules.State, seen: rules.Observation, key: Key) -> Tensor:
 
 
 def _tensordict(state: rules.State, seen: rules.Observation) -> TensorDict:
-    observation = {name: torch.as_tensor(array) for name, array in seen._asdict().items()}
+    observation = {name: torch.as_tensor(array) for name, array in seen.arrays().items()}
     game = {name: torch.as_tensor(array) for name, array in state.arrays().items()}
     size = [observation["visited"].shape[0]]
     return TensorDict({**observation, "game": TensorDict(game, size)}, size)

@@ -24,7 +24,7 @@ from dan_policy.registry import find, load, network_name
 from dan_policy.symmetry import SYMMETRIES
 from mtsp_env import rules
 from mtsp_env.checks import check_count, check_seconds
-from mtsp_env.instance import Instance, Tours
+from mtsp_env.instance import Instance, Tours, check_plain
 from mtsp_env.tours import check_prefixes, check_tours, makespan
 
 Precision = Literal["auto", "float32", "bfloat16"]
@@ -137,8 +137,10 @@ def solve(
         ImportError: ``improve`` without Numba.
         OSError: no such weights.
         TypeError: an option that does not exist.
-        ValueError: bad weights, an option outside its range, or one that the policy does not have.
+        ValueError: an instance with world fields, bad weights, an option outside its range, or one that the policy
+            does not have.
     """
+    check_plain(instance)
     options = replace(options or SolveOptions(), **changes)
     begun = [] if prefixes is None else check_prefixes(instance, prefixes)
     improve = _improvement(options, begun)

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 
 from mtsp_env.checks import check_count, check_seconds
-from mtsp_env.files import atomic_write
 from mtsp_env.instance import Instance
 from mtsp_env.picture import Picture, missing_matplotlib, new_figure
-from mtsp_env.schedule import Log, end_time, make_log, moment
+from mtsp_env.schedule import end_time, make_log, moment
+from mtsp_env.tours import Log
+from mtsp_env.writing import atomic_write
 
 Draw = Callable[[float], np.ndarray]  # a time -> its frame, uint8 (480, 640, 3)
 

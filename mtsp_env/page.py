@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from mtsp_env.files import atomic_write
 from mtsp_env.instance import Instance
 from mtsp_env.picture import COLOURS, format_lengths
-from mtsp_env.schedule import Leg, Log, end_time, make_log
-from mtsp_env.tours import path_lengths
+from mtsp_env.schedule import end_time, make_log
+from mtsp_env.tours import Leg, Log, path_lengths
+from mtsp_env.writing import atomic_write
 
 
 def save_page(
@@ -70,8 +70,8 @@ def _describe(instance: Instance, log: Log, share: bool, notes: Sequence[str]) -
     paths = [[0, *(leg.node for leg in legs)] for legs in log]
     lengths = path_lengths(instance.nodes, paths) * instance.scale
     end = end_time(log)
-    # The makespan is a length if tours are given, which take as long as they are, and a time in a world.
-    makespan, *labels = format_lengths([end * instance.scale, *lengths.tolist()])
+    # Tours take as long as they are. The times of a log are those of the clock, which counts in whole ticks.
+    last, *labels = format_lengths([end * instance.scale, *lengths.tolist()])
     longest = float(lengths.max())
     agents = []
     for agent, (legs, length, label) in enumerate(zip(log, lengths.tolist(), labels, strict=True)):
@@ -87,10 +87,10 @@ def _describe(instance: Instance, log: Log, share: bool, notes: Sequence[str]) -
             }
         )
     return {
-        "heading": f"{instance.name or 'mTSP'}: {instance.n_nodes - 1} cities, {len(log)} agents, makespan {makespan}",
+        "heading": f"{instance.name or 'mTSP'}: {instance.n_nodes - 1} cities, {len(log)} agents, {'makespan' if share else 'the end at'} {last}",
         "nodes": instance.nodes.tolist(),
         "scale": instance.scale,
-        "decimals": len(makespan.partition(".")[2]),
+        "decimals": len(last.partition(".")[2]),
         "end": end,
         "agents": agents,
         "longest": int(np.argmax(lengths)) if share and longest else -1,

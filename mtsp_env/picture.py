@@ -100,7 +100,7 @@ class Picture:
         self._show(moment.paths, moment.lengths, moment.owner, longest)
         positions = np.array([path[-1] for path in moment.paths])
         self.heads.set(offsets=positions, facecolor=self.colours, edgecolor="white")
-        if over:
+        if over and math.isclose(moment.lengths.max(), end):  # nobody has waited: the time is the makespan
             self._set_title(self._summary(moment.lengths))
             return
         now = format_lengths([time * self.instance.scale, end * self.instance.scale])[0]

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mtsp_env.animation import animate, check_animation_suffix
-from mtsp_env.files import atomic_write
 from mtsp_env.instance import Instance
 from mtsp_env.page import make_page, save_page
 from mtsp_env.picture import COLOURS, Picture, format_lengths, missing_matplotlib, new_figure
 from mtsp_env.schedule import check_paths
+from mtsp_env.writing import atomic_write
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

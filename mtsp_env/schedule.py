@@ -8,24 +8,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from mtsp_env.instance import WORLD_FIELDS, Instance
-
-
-class Leg(NamedTuple):
-    """One leg of an agent's way: to where, and the times at which it sets off, arrives and is ready to go on."""
-
-    node: int
-    departed: float
-    arrived: float
-    ready: float  # later than ``arrived`` if the visit takes time
-
-
-Log = list[list[Leg]]
-"""One list of legs per agent, in order. Every agent starts at the depot at time 0."""
+from mtsp_env.tours import Leg, Log
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ def test_a_log_says_when_everybody_is_home() -> None:
     data = data_of(make_page(instance, log=log))
     assert [agent["last"] for agent in data["agents"]] == ["1,500", "–", "–", "0"]
     assert data["agents"][1]["legs"][1] == [0, 1.0, None, None]
-    assert data["heading"] == "mTSP: 2 cities, 4 agents, makespan 1,500"
+    assert data["heading"] == "mTSP: 2 cities, 4 agents, the end at 1,500"
     assert (data["lastColumn"], data["longest"]) == ("home at", -1)
 
 

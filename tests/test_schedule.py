@@ -6,10 +6,13 @@ import math
 
 import numpy as np
 import pytest
+from helpers.games import play
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mtsp_env import Instance, tour_lengths, uniform
+from mtsp_env import Instance, mtsp_v0, tour_lengths, uniform
+from mtsp_env.distributions import SCENARIOS
+from mtsp_env.render import make_page
 from mtsp_env.schedule import end_time, make_log, moment
 
 
@@ -95,3 +98,17 @@ def test_tours_do_not_say_when_a_world_is_driven(square: Instance, square_tours:
     with pytest.raises(ValueError, match=r"world fields \['speeds'\]; pass the log of a game"):
         make_log(world, square_tours)
     assert make_log(world, log=[[(1, 0.0, 1.0, 1.0)], []])
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_the_log_of_every_world_can_be_shown(scenario: str) -> None:
+    env = mtsp_v0.env(n_nodes=15, n_agents=3, scenario=scenario)
+    for seed in range(5):
+        env.reset(seed=seed)
+        play(env, seed)
+        instance, log = env.unwrapped.instance, make_log(env.unwrapped.instance, log=env.unwrapped.log)
+        late = end_time(log) - env.infos["agent_0"]["makespan"]
+        assert -1e-6 <= late <= 0.01 * (1 + max(map(len, log)))  # every leg ends with the tick in which it arrives
+        last = moment(instance, log, end_time(log))
+        assert (last.owner[1:] >= 0).all()
+        assert "the end at" in make_page(instance, log=env.unwrapped.log)
