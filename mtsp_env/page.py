@@ -86,8 +86,9 @@ def _describe(instance: Instance, log: Log, share: bool, notes: Sequence[str]) -
                 "last": part if share else _home(legs, instance.scale, end),
             }
         )
+    ending = f"makespan {last}" if share else f"the end at {last}"
     return {
-        "heading": f"{instance.name or 'mTSP'}: {instance.n_nodes - 1} cities, {len(log)} agents, {'makespan' if share else 'the end at'} {last}",
+        "heading": f"{instance.name or 'mTSP'}: {instance.n_nodes - 1} cities, {len(log)} agents, {ending}",
         "nodes": instance.nodes.tolist(),
         "scale": instance.scale,
         "decimals": len(last.partition(".")[2]),
