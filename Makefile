@@ -31,8 +31,10 @@ lint: $(VENV)/.dev
 types: $(VENV)/.dev
 	$(BIN)/mypy
 
+# The source distribution and the wheel, and whether package indexes would show their descriptions.
 wheel: $(VENV)/.dev
-	$(BIN)/python -m build --wheel
+	$(BIN)/python -m build
+	$(BIN)/twine check --strict dist/*
 
 # The site, in docs/_build/html. Runs the notebooks, and fails on any warning.
 docs: $(VENV)/.dev

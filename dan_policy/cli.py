@@ -1,15 +1,16 @@
-"""The command ``mtsp``: solve instances from files, generate instances. Imports torch only to solve with a policy.
+"""The command ``mtsp``: solve and generate instances, serve. Imports torch only to solve with a policy.
 
 ``arguments.parse`` reads the signatures and docstrings of ``solve`` and ``generate``.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,10 +19,11 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from dan_policy.arguments import SECONDS, Positional, arg, default, parse, refuse, whole
+from dan_policy.serve import serve
+from mtsp_env import render
 from mtsp_env.distributions import sample
 from mtsp_env.files import read_instance, write_instance, write_tours
 from mtsp_env.instance import Instance, Tours
-from mtsp_env.render import check_suffix, save_picture
 from mtsp_env.tours import lower_bound, tour_lengths
 from mtsp_env.tsplib import read_tsplib
 from mtsp_env.version import __version__
@@ -44,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"mtsp {__version__}")
         sys.exit(0)
     try:
-        command = parse([solve, generate], DESCRIPTION, argv)
+        command = parse([solve, generate, serve], DESCRIPTION, argv)
         command()
         sys.stdout.flush()
     except KeyboardInterrupt:
@@ -91,6 +93,8 @@ def solve(
     view: Annotated[int | None, whole(1, "K"), default("all below 400 nodes, else 100")] = None,
     improve: Annotated[float | None, SECONDS, default("no improvement")] = None,
     plot: Annotated[str | None, arg(metavar="PATH"), default("no picture")] = None,
+    animate: Annotated[str | None, arg(metavar="PATH"), default("no animation")] = None,
+    html: Annotated[str | None, arg(metavar="PATH"), default("no page")] = None,
     out: Annotated[str | None, arg(metavar="PATH"), default("no file")] = None,
     as_json: Annotated[bool, arg(name="json"), default("off")] = False,
 ) -> None:
@@ -120,6 +124,8 @@ def solve(
         view: agents see at most this many cities, the nearest unvisited ones
         improve: time for which the reference solver improves the policy's tours
         plot: draw the tours: .png, .svg, .pdf, ...
+        animate: draw the agents on their tours: .gif, or .mp4 (extra video)
+        html: write a page for the browser, with a slider over time and the table
         out: write the tours as JSON
         as_json: print one JSON object per file and nothing else
     """
@@ -141,21 +147,36 @@ def solve(
         raise ValueError("required: FILE, at least one")
     _check_options(method, options)
     instances = [_read(Path(file), agents) for file in files]
-    plots, outs = _outputs(plot, instances), _outputs(out, instances)
-    _check_outputs(files, plots, outs)
+    paths = {"out": out, "plot": plot, "animate": animate, "html": html}
+    outputs = {option: _outputs(path, instances) for option, path in paths.items()}
+    _check_outputs(files, outputs)
     solver = _dan(seed=seed, **options["dan"]) if method == "dan" else _reference(seconds, seed)
     show = (lambda record: print(json.dumps(record), flush=True)) if as_json else _table()
 
-    for instance, plot_path, out_path in zip(instances, plots, outs, strict=True):
+    for number, instance in enumerate(instances):
         plan = solver(instance)
         record = _record(instance, plan)
         show(record)
-        if out_path is not None:
-            with _writing(out_path, quiet=as_json):
-                write_tours(out_path, **record)
-        if plot_path is not None:
-            with _writing(plot_path, quiet=as_json):
-                save_picture(plot_path, instance, plan.tours)
+        for option, write in WRITERS.items():
+            path = outputs[option][number]
+            if path is not None:
+                with _writing(path, quiet=as_json):
+                    write(path, instance, record)
+
+
+def _save_page(path: Path, instance: Instance, record: dict[str, Any]) -> None:
+    """Below its table, a page says what the table on the terminal says: how it was planned, and the lower bound."""
+    bound = render.format_lengths([record["makespan"], record["lower_bound"]])[1]
+    notes = [f"{record['method']} in {record['seconds']:.3g} s.", f"No makespan can be below {bound}."]
+    render.save_page(path, instance, record["tours"], notes=notes)
+
+
+WRITERS: dict[str, Callable[[Path, Instance, dict[str, Any]], None]] = {
+    "out": lambda path, instance, record: write_tours(path, **record),
+    "plot": lambda path, instance, record: render.save_picture(path, instance, record["tours"]),
+    "animate": lambda path, instance, record: render.animate(path, instance, record["tours"]),
+    "html": _save_page,
+}
 
 
 def _check_options(method: str, options: dict[str, dict[str, Any]]) -> None:
@@ -251,16 +272,21 @@ def _outputs(path: str | None, instances: Sequence[Instance]) -> list[Path | Non
     return outputs
 
 
-def _check_outputs(files: Sequence[str], plots: Sequence[Path | None], outs: Sequence[Path | None]) -> None:
+def _check_outputs(files: Sequence[str], outputs: Mapping[str, Sequence[Path | None]]) -> None:
     taken = {Path(file).resolve() for file in files}
-    for path in filter(None, [*plots, *outs]):
+    for path in filter(None, itertools.chain(*outputs.values())):
         if not path.parent.is_dir():
             raise ValueError(f"{path}: no such folder")
         if path.resolve() in taken:
             raise ValueError(f"{path}: would overwrite another file of this command")
         taken.add(path.resolve())
-    for plot in filter(None, plots):
-        check_suffix(plot)
+    for plot in filter(None, outputs["plot"]):
+        render.check_suffix(plot)
+    for animation in filter(None, outputs["animate"]):
+        render.check_animation_suffix(animation)
+    for page in filter(None, outputs["html"]):
+        if page.suffix.lower() not in (".html", ".htm"):
+            raise ValueError(f"{page}: unknown suffix {page.suffix!r}; choose from ['.html', '.htm']")
 
 
 def _record(instance: Instance, plan: Plan) -> dict[str, Any]:

@@ -4,7 +4,7 @@
 >>> env = mtsp_v0.env(n_nodes=50, n_agents=5)
 
 Importing this package needs only NumPy, Gymnasium and PettingZoo; the batched TorchRL environment is in
-``mtsp_env.batched``.
+``mtsp_env.batched``. It also registers the single-agent view, ``gymnasium.make("mtsp/MinMaxMTSP-v0")``.
 """
 
 from mtsp_env.distributions import DISTRIBUTIONS, SCENARIOS, clustered, uniform
@@ -36,7 +36,10 @@ __all__ = [
 
 
 def _register() -> None:
-    """Make ``pettingzoo.make("aec", "mtsp/mtsp-v0")`` work where this PettingZoo has a registry (1.27 on)."""
+    """Name the environments for ``gymnasium.make`` and, if this PettingZoo has it (1.27 on), ``pettingzoo.make``."""
+    import gymnasium
+
+    gymnasium.register("mtsp/MinMaxMTSP-v0", entry_point="mtsp_env.single:MinMaxMTSP")
     try:
         from pettingzoo import register
     except ImportError:

@@ -175,6 +175,16 @@ def test_files_hold_what_was_printed(folder, solver, capsys) -> None:
     assert Path("tours.svg").read_bytes().startswith(b"<?xml")
 
 
+def test_animations_and_pages_show_what_was_printed(folder, solver, capsys) -> None:
+    assert main(["solve", "ten.tsp", "--agents", "2", "--json", "--animate", "a.gif", "--html", "a.html"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert Path("a.gif").read_bytes().startswith(b"GIF89a")
+    page = Path("a.html").read_text()
+    assert f"makespan {record['makespan']:.2f}" in page
+    assert "fake in 0.25 s." in page
+    assert "No makespan can be below 15.00." in page
+
+
 def test_several_files_get_their_names_into_the_outputs(folder, solver, capsys) -> None:
     Path("again.tsp").write_text(Path("ten.tsp").read_text())
     write_instance("slash.json", Instance([[0.0, 0.0], [1.0, 1.0]], 1, name="../a b"))
@@ -229,6 +239,9 @@ def test_it_says_where_the_files_are(folder, solver, capsys) -> None:
         ("square.json --seed 9223372036854775808", "--seed: must be"),
         ("square.json --decode beam", "invalid choice 'beam' for argument '--decode'"),
         ("square.json --plot t.xyz", "t.xyz: unknown picture suffix 'xyz'"),
+        ("square.json --animate t.png", "t.png: unknown animation suffix '.png'; choose from ['.gif', '.mp4']"),
+        ("square.json --html t.pdf", "t.pdf: unknown suffix '.pdf'; choose from ['.html', '.htm']"),
+        ("square.json --html nowhere/t.html", "nowhere/t.html: no such folder"),
         ("square.json --plot nowhere/t.png", "nowhere/t.png: no such folder"),
         ("square.json --out nowhere/t.json", "nowhere/t.json: no such folder"),
         ("square.json --out square.json", "square.json: would overwrite another file of this command"),
@@ -340,5 +353,5 @@ def test_version_and_help(capsys) -> None:
 
 
 def test_no_command_or_an_unknown_one(capsys) -> None:
-    assert "Expected one of {solve, generate}" in refused(capsys)
+    assert "Expected one of {solve, generate, serve}" in refused(capsys)
     assert "Unrecognized options: sovle" in refused(capsys, "sovle")

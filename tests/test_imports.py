@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ("mtsp_env", "dan_policy", "train", "benchmarks")  # each may import those before it
 FILES = sorted(file.relative_to(ROOT).as_posix() for package in PACKAGES for file in (ROOT / package).rglob("*.py"))
 
-FACES = ["mtsp_env.mtsp_v0", "mtsp_env.batched"]
+FACES = ["mtsp_env.mtsp_v0", "mtsp_env.batched", "mtsp_env.single", "mtsp_env.wrappers"]
 EXTRAS = ["mtsp_env.reference", "mtsp_env.render"]
 
 # What a file may not import, anywhere in it
@@ -43,6 +43,7 @@ FORBIDDEN = {
 NEEDS_AN_EXTRA = {"torch", "tensordict", "torchrl", "numba", "matplotlib", "vrplib"}
 LIGHT = [
     "__init__",
+    "__main__",
     "arrays",
     "checks",
     "distributions",
@@ -51,11 +52,16 @@ LIGHT = [
     "log",
     "machine",
     "mtsp_v0",
+    "page",
+    "picture",
     "rules",
+    "schedule",
+    "single",
     "state",
     "tours",
     "tsplib",
     "world",
+    "wrappers",
 ]
 
 

@@ -1,0 +1,113 @@
+"""A page for the browser: the tours on a map with a slider over time, and the table beside it, in one HTML file.
+
+The file loads nothing from anywhere. ``page.html`` is its template.
+"""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+import os
+import re
+from collections.abc import Sequence
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+
+from mtsp_env.instance import Instance
+from mtsp_env.picture import COLOURS, format_lengths
+from mtsp_env.schedule import end_time, make_log
+from mtsp_env.tours import Leg, Log, path_lengths
+from mtsp_env.writing import atomic_write
+
+
+def save_page(
+    path: str | os.PathLike,
+    instance: Instance,
+    tours: Sequence[Sequence[int]] | None = None,
+    log: Sequence[Sequence[Sequence[float]]] | None = None,
+    notes: Sequence[str] = (),
+) -> None:
+    """Write ``make_page(...)`` to a file. If this fails, an existing file stays as it was.
+
+    Raises:
+        OSError: the file cannot be written.
+        ValueError: tours or a log that do not fit the instance.
+    """
+    page = make_page(instance, tours, log, notes)
+    with atomic_write(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+
+
+def make_page(
+    instance: Instance,
+    tours: Sequence[Sequence[int]] | None = None,
+    log: Sequence[Sequence[Sequence[float]]] | None = None,
+    notes: Sequence[str] = (),
+) -> str:
+    """A team on its tours as an HTML page: a map, a slider over time, and a table of the tours.
+
+    Args:
+        instance: the problem.
+        tours: one per agent. All agents set off at time 0 and never wait. The instance must be plain.
+        log: instead of tours, one list of (node, departed, arrived, ready) per agent, in units of time.
+        notes: sentences below the table.
+
+    Raises:
+        ValueError: not exactly one of ``tours`` and ``log``, or one that does not fit the instance.
+    """
+    data = _describe(instance, make_log(instance, tours, log), share=log is None, notes=notes)
+    template = files("mtsp_env").joinpath("page.html").read_text(encoding="utf-8")
+    encoded = json.dumps(data, allow_nan=False).replace("<", "\\u003c")  # a name may hold "</script>"
+    parts = {"{{title}}": html.escape(instance.name or "mTSP"), "{{data}}": encoded}
+    return re.sub(r"{{title}}|{{data}}", lambda found: parts[found[0]], template)
+
+
+def _describe(instance: Instance, log: Log, share: bool, notes: Sequence[str]) -> dict[str, Any]:
+    """What the script of the page reads. Times are in units of distance at speed 1; infinity becomes null."""
+    paths = [[0, *(leg.node for leg in legs)] for legs in log]
+    lengths = path_lengths(instance.nodes, paths) * instance.scale
+    end = end_time(log)
+    # Tours take as long as they are. The times of a log are those of the clock, which counts in whole ticks.
+    last, *labels = format_lengths([end * instance.scale, *lengths.tolist()])
+    longest = float(lengths.max())
+    agents = []
+    for agent, (legs, length, label) in enumerate(zip(log, lengths.tolist(), labels, strict=True)):
+        part = f"{length / longest:.0%}" if longest else ""
+        agents.append(
+            {
+                "colour": COLOURS[agent % len(COLOURS)],
+                "dashed": agent >= len(COLOURS),
+                "legs": [[leg.node, *(_finite(time) for time in leg[1:])] for leg in legs],
+                "cities": sum(node != 0 for node in paths[agent]),
+                "length": label,
+                "last": part if share else _home(legs, instance.scale, end),
+            }
+        )
+    ending = f"makespan {last}" if share else f"the end at {last}"
+    return {
+        "heading": f"{instance.name or 'mTSP'}: {instance.n_nodes - 1} cities, {len(log)} agents, {ending}",
+        "nodes": instance.nodes.tolist(),
+        "scale": instance.scale,
+        "decimals": len(last.partition(".")[2]),
+        "end": end,
+        "agents": agents,
+        "longest": int(np.argmax(lengths)) if share and longest else -1,
+        "lastColumn": "share" if share else "home at",
+        "notes": list(notes),
+    }
+
+
+def _finite(time: float) -> float | None:
+    return time if math.isfinite(time) else None
+
+
+def _home(legs: Sequence[Leg], scale: float, end: float) -> str:
+    """When an agent has come home for good; a dash if it has not."""
+    if not legs:
+        return format_lengths([0.0, end * scale])[0]
+    if legs[-1].node != 0 or not math.isfinite(legs[-1].arrived):
+        return "–"
+    return format_lengths([legs[-1].arrived * scale, end * scale])[0]
