@@ -38,7 +38,7 @@ FORBIDDEN = {
     "dan_policy/actor.py": ["mtsp_env*"],
     "benchmarks/peers/rl4co_speed.py": ["mtsp_env*", "dan_policy*", "train*", "benchmarks*"],
 }
-NEEDS_AN_EXTRA = {"torch", "tensordict", "torchrl", "numba", "matplotlib", "vrplib"}
+NEEDS_AN_EXTRA = {"torch", "tensordict", "torchrl", "numba", "scipy", "matplotlib", "vrplib"}
 LIGHT = [
     "__init__",
     "arrays",
@@ -49,6 +49,7 @@ LIGHT = [
     "machine",
     "mtsp_v0",
     "rules",
+    "spanning_tree",
     "tours",
     "tsplib",
 ]
