@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip
 INSTALL := $(PIP) install --quiet --constraint constraints.txt
 
-.PHONY: demo test test-fast lint types wheel clean
+.PHONY: demo test test-fast fuzz lint types wheel clean
 
 # Plans the tours of the examples with the shipped network and says where the pictures are.
 demo: $(VENV)/.demo
@@ -19,6 +19,10 @@ test: $(VENV)/.dev
 # The quick tests alone, on all cores: about two minutes on two cores.
 test-fast: $(VENV)/.dev
 	$(BIN)/python -m pytest -m "not slow and not gpu" --numprocesses auto
+
+# 10,000 broken inputs for each reader of files, on all cores; the ordinary tests try 100. Prints counts and times.
+fuzz: $(VENV)/.dev
+	$(BIN)/python -m pytest tests/fuzz -m fuzz --hypothesis-profile=fuzz --hypothesis-show-statistics --numprocesses auto
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .

@@ -12,7 +12,9 @@ A *network* is a module or a plain function that takes the tensors of its ``in_k
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
+import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType
@@ -27,13 +29,35 @@ Key = str | tuple[str, ...]
 OBSERVATION: tuple[Key, ...] = ("cities", "agents", "visited")
 
 
+class FiniteCategorical(MaskedCategorical):
+    """The softmax of logits over a mask.
+
+    Raises:
+        ValueError: the greatest logit of the mask is NaN or infinity.
+    """
+
+    def __init__(self, logits: Tensor, *, mask: Tensor, **options: Any):
+        if not torch.compiler.is_compiling():
+            check_greatest(logits.detach().masked_fill(~mask, -torch.inf).amax(-1))
+        super().__init__(logits, mask=mask, **options)
+
+
+def check_greatest(logits: Tensor) -> None:
+    """Raise ValueError if a greatest legal logit (B,) is NaN, as it is if any of them is, or infinity."""
+    if not (logits < torch.inf).all():
+        raise ValueError(
+            f"the policy's logits must be finite, got {float(logits.max())}: parameters of the network may be NaN, "
+            "infinite or far too large, or its input is"
+        )
+
+
 def make_actor(network: Network, in_keys: Sequence[Key] | None = None) -> ProbabilisticActor:
     """A TorchRL actor that samples ``action`` from the softmax of the network's logits over ``action_mask``.
 
     Args:
         network: a module or a plain function. It is called with the tensors of ``in_keys``, for example cities
             (..., n, 2), agents (..., m, 3) and visited (..., n), and returns logits (..., n). Masked nodes get
-            probability 0, whatever their logits.
+            probability 0, whatever their logits. ValueError if a legal node's logit is NaN or infinity.
         in_keys: the keys of the observation that it takes, in order; ``action_mask`` and nested keys such as
             ``("game", "nodes")`` may be among them. None: the network's attribute ``in_keys``, or ``OBSERVATION`` if
             it has none.
@@ -47,7 +71,7 @@ def make_actor(network: Network, in_keys: Sequence[Key] | None = None) -> Probab
         TensorDictModule(network, keys, ["logits"]),
         in_keys={"logits": "logits", "mask": "action_mask"},
         out_keys=["action"],
-        distribution_class=MaskedCategorical,
+        distribution_class=FiniteCategorical,
         default_interaction_type=ExplorationType.RANDOM,
     )
 

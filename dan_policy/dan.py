@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from dan_policy.layers import AttentionLayer, Norm, masked_mean, open_nodes
+from dan_policy.layers import AttentionLayer, Norm, check_clip, check_sizes, masked_mean, open_nodes
 
 
 @dataclass(frozen=True)
@@ -18,8 +18,9 @@ class DANConfig:
     """The architecture of a DAN; presets ``DANConfig.paper()`` and ``DANConfig.official()``.
 
     Raises:
-        ValueError: a size below 1 (agent layers: below 0), a number of heads that does not divide the width, an
-            unknown norm, a clip that is not above 0, or a view without ``prune_visited``.
+        ValueError: a size below 1 (agent layers: below 0) or beyond ``layers.GREATEST``, a number of heads that does
+            not divide the width, an unknown norm, a clip that is not above 0 or beyond ``layers.GREATEST_CLIP``, or a
+            view without ``prune_visited``.
     """
 
     embed_dim: int = 128  # d
@@ -35,18 +36,17 @@ class DANConfig:
     view: int | None = None  # with prune_visited: see at most this many cities, the nearest unvisited ones
 
     def __post_init__(self) -> None:
-        for name in ("embed_dim", "feedforward_dim", "n_heads", "city_layers", "agent_layers", "city_agent_layers"):
-            value, minimum = getattr(self, name), 0 if "agent" in name else 1
-            if not isinstance(value, int) or value < minimum:
-                raise ValueError(f"{name} must be a whole number of at least {minimum}, got {value!r}")
+        check_sizes(self, "embed_dim", "feedforward_dim", "n_heads", "city_layers")
+        check_sizes(self, "agent_layers", "city_agent_layers", minimum=0)
         if self.embed_dim % self.n_heads:
             raise ValueError(f"n_heads must divide embed_dim={self.embed_dim}, got {self.n_heads}")
         for norm in (self.encoder_norm, self.decoder_norm):
             if norm not in ("pre", "post"):
                 raise ValueError(f"unknown norm {norm!r}; choose from ['pre', 'post']")
-        if not self.tanh_clip > 0:
-            raise ValueError(f"tanh_clip must be above 0, got {self.tanh_clip!r}")
-        if self.view is not None and not (isinstance(self.view, int) and self.view >= 1 and self.prune_visited):
+        check_clip(self.tanh_clip)
+        if type(self.prune_visited) is not bool:
+            raise ValueError(f"prune_visited must be True or False, got {self.prune_visited!r}")
+        if self.view is not None and not (type(self.view) is int and self.view >= 1 and self.prune_visited):
             raise ValueError(f"view must be None, or with prune_visited at least 1 city, got {self.view!r}")
 
     @classmethod

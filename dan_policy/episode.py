@@ -104,7 +104,9 @@ def find_device(device: torch.device | str | None = None) -> torch.device:
     """
     try:
         chosen = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        if chosen.type == "meta" or (chosen.type == "cpu" and chosen.index):  # PyTorch takes any number for the CPU
+            raise RuntimeError("meta tensors hold no numbers, and there is one device for all CPUs")
         return torch.empty(0, device=chosen).device  # with its index: "cuda" is "cuda:0" by default
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
+    except (RuntimeError, AssertionError, NotImplementedError, ImportError) as error:
         reason = str(error).splitlines()[0]
         raise ValueError(f"no device {str(device)!r} here; choose for example 'cpu' or 'cuda' ({reason})") from error

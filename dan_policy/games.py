@@ -15,7 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 
-from dan_policy.actor import Key, Network, network_keys
+from dan_policy.actor import Key, Network, check_greatest, network_keys
 from dan_policy.symmetry import views
 from mtsp_env import rules
 from mtsp_env.instance import Instance, Problem, Tours, batch
@@ -86,7 +86,8 @@ def play(
         logits = logits.masked_fill(~mask, -torch.inf)
         best, action = logits.max(1)  # (B,) each
         if not best.isfinite().all():
-            raise ValueError(f"the policy's logits must be finite for at least one legal node, got {float(best.min())}")
+            check_greatest(best)
+            raise ValueError("the policy's logits must be finite for at least one legal node, got -inf for all of them")
         if generator is not None:
             action = torch.multinomial(logits.float().softmax(1), 1, generator=generator)[:, 0]
         state = rules.depart(state, game, action.numpy() if isinstance(state.ready, np.ndarray) else action)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from dan_policy.layers import AttentionLayer, open_nodes
+from dan_policy.layers import AttentionLayer, check_clip, check_sizes, open_nodes
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,8 @@ class JointConfig:
     """The architecture of a JointDAN.
 
     Raises:
-        ValueError: a size below 1, a number of heads that does not divide the width, a clip that is not above 0, or a
-            view below 1.
+        ValueError: a size below 1 or beyond ``layers.GREATEST``, a number of heads that does not divide the width, a
+            clip that is not above 0 or beyond ``layers.GREATEST_CLIP``, or a view below 1.
     """
 
     embed_dim: int = 128  # d
@@ -35,15 +35,11 @@ class JointConfig:
     view: int | None = None  # see at most this many cities, the nearest unvisited ones; None: all of them
 
     def __post_init__(self) -> None:
-        for name in ("embed_dim", "feedforward_dim", "n_heads", "n_layers"):
-            value = getattr(self, name)
-            if not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
+        check_sizes(self, "embed_dim", "feedforward_dim", "n_heads", "n_layers")
         if self.embed_dim % self.n_heads:
             raise ValueError(f"n_heads must divide embed_dim={self.embed_dim}, got {self.n_heads}")
-        if not self.tanh_clip > 0:
-            raise ValueError(f"tanh_clip must be above 0, got {self.tanh_clip!r}")
-        if self.view is not None and not (isinstance(self.view, int) and self.view >= 1):
+        check_clip(self.tanh_clip)
+        if self.view is not None and not (type(self.view) is int and self.view >= 1):
             raise ValueError(f"view must be None or at least 1 city, got {self.view!r}")
 
 

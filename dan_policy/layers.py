@@ -11,6 +11,26 @@ from torch.nn import functional as F
 Norm = Literal["pre", "post"]
 
 
+GREATEST = {"dim": 16_384, "heads": 1024, "layers": 1000}
+"""Greatest widths, numbers of heads and numbers of layers: larger networks take hours or all memory to build."""
+
+GREATEST_CLIP = 1e6
+
+
+def check_sizes(config: object, *names: str, minimum: int = 1) -> None:
+    """Raise ValueError unless these fields of a configuration are whole numbers from ``minimum`` to their GREATEST."""
+    for name in names:
+        value, maximum = getattr(config, name), GREATEST[name.rpartition("_")[2]]
+        if type(value) is not int or not minimum <= value <= maximum:
+            raise ValueError(f"{name} must be a whole number from {minimum} to {maximum}, got {value!r}")
+
+
+def check_clip(value: float) -> None:
+    """Raise ValueError unless ``value`` can be the tanh_clip of a network."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value <= GREATEST_CLIP:
+        raise ValueError(f"tanh_clip must be a number above 0 and at most {GREATEST_CLIP:g}, got {value!r}")
+
+
 class AttentionLayer(nn.Module):
     """Multi-head attention and a feed-forward sublayer, each with a residual connection and a layer norm.
 

@@ -1,11 +1,13 @@
 """Networks by name, and on disk: safetensors files whose metadata hold the configuration as JSON.
 
-Nothing is unpickled, and a file never decides by itself which code is imported: it may name a factory of the user's
-own, but ``load`` calls one only if its caller names it.
+A checksum in the metadata covers everything; files without one, which older versions wrote, are read as well. Nothing
+is unpickled, and a file never decides by itself which code is imported: it may name a factory of the user's own, but
+``load`` calls one only if its caller names it.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import pkgutil
@@ -23,8 +25,9 @@ from torch import Tensor, nn
 
 from dan_policy.actor import Network, network_keys
 from dan_policy.dan import DAN, DANConfig
+from dan_policy.episode import find_device
 from dan_policy.joint import JointConfig, JointDAN
-from mtsp_env.files import atomic_write
+from mtsp_env.writing import atomic_write
 
 FORMAT = "dan-policy-2"
 DAN_ONLY = "dan-policy-1"  # the first format, which knew no other network by name; its files are still read
@@ -105,6 +108,7 @@ def save(
     Raises:
         OSError: the file cannot be written.
         TypeError: a value that is not JSON, or a network that is no module: a plain function has no weights.
+        ValueError: a parameter that is not finite.
     """
     if not isinstance(network, nn.Module):
         raise TypeError(f"network must be a torch.nn.Module, got {type(network).__name__}")
@@ -117,6 +121,8 @@ def save(
         "extra": json.dumps(extra),
     }
     tensors = {key: value.detach().cpu().contiguous() for key, value in network.state_dict().items()}
+    _check_finite(network, tensors)
+    metadata["checksum"] = _checksum(metadata, tensors)
     with atomic_write(path) as temporary:
         temporary.write_bytes(serialise(tensors, metadata))  # save_file's files can be read by their owner alone
 
@@ -135,14 +141,15 @@ def load(
 
     Raises:
         OSError: no such file.
-        ValueError: not such a file, a damaged one, weights that do not fit, or a file that holds no network of
-            ``NETWORKS`` while ``network`` is None.
+        ValueError: not such a file, a damaged one, parameters that are not finite, weights that do not fit, a file that
+            holds no network of ``NETWORKS`` while ``network`` is None, or no such device.
     """
-    path = find(path)
-    metadata, tensors = _read(path, device)
+    path, device = find(path), find_device(device)
+    kept = _read(path)
     try:
-        module = network if isinstance(network, nn.Module) else _described_network(metadata, network, device)
-        module.load_state_dict(tensors)
+        module = network if isinstance(network, nn.Module) else _described_network(kept, network)
+        _check_finite(module, kept.tensors)
+        module.load_state_dict(kept.tensors)
     except (KeyError, TypeError, RuntimeError, ValueError) as error:
         raise ValueError(f"{path}: weights and network do not fit ({error})") from error
     return module.to(device).eval()
@@ -150,12 +157,12 @@ def load(
 
 def load_extra(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The values that were given to ``save`` beside the network. Raises as ``load``."""
-    return json.loads(_read(find(path), "cpu")[0]["extra"])
+    return _read(find(path)).extra
 
 
 def load_config(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The configuration of a file's network, or the keyword arguments of its factory. Raises as ``load``."""
-    return json.loads(_read(find(path), "cpu")[0]["config"]) or {}
+    return _read(find(path)).config or {}
 
 
 def shipped() -> list[str]:
@@ -185,26 +192,24 @@ def _registered_name(network: nn.Module) -> str | None:
     return next((name for name, kind in NETWORKS.items() if isinstance(network, kind.module)), None)
 
 
-def _described_network(metadata: Mapping[str, str], network: str | None, device: torch.device | str) -> nn.Module:
+def _described_network(kept: _Contents, network: str | None) -> nn.Module:
     """The network that a file describes, built by ``network`` if the file names none of ``NETWORKS``."""
-    config = json.loads(metadata["config"])
-    if metadata["format"] == DAN_ONLY:
-        described = {"factory": None} if config is None else {"name": "dan"}
-    else:
-        described = dict(json.loads(metadata["network"]))
-    name, factory = described.get("name"), described.get("factory")
+    name, factory = kept.described.get("name"), kept.described.get("factory")
     if name is not None:
         if name not in NETWORKS:
             raise ValueError(f"it holds the network {name!r}, which is none of {sorted(NETWORKS)}")
         if network not in (None, name):
             raise ValueError(f"it holds the network {name!r}, not {network!r}")
         with torch.device("meta"):  # no random weights, which would be overwritten, and no use of the global generator
-            empty = build(name, config)
-        return empty.to_empty(device=device)
+            empty = build(name, kept.config)
+        shapes = {key: value.shape for key, value in empty.state_dict().items()}
+        if shapes != {key: value.shape for key, value in kept.tensors.items()}:  # before they take any memory
+            raise ValueError(f"its tensors do not have the names and shapes of the network {name!r} that it describes")
+        return empty.to_empty(device="cpu")
     if network is None or network in NETWORKS:
         named = f"names the factory {factory!r}" if factory else "holds weights alone"
         raise ValueError(f"it {named}: give the network, network={factory or 'package.module:factory'!r} for example")
-    return build(network, config)
+    return build(network, kept.config)
 
 
 def _import_factory(name: str) -> Any:
@@ -236,14 +241,55 @@ def _working_directory_importable() -> Iterator[None]:
         sys.path.remove(here)
 
 
-def _read(path: Path, device: torch.device | str) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Metadata and tensors of a file that ``save`` wrote."""
+@dataclass(frozen=True)
+class _Contents:
+    """What a file holds: how to build the network, its configuration (None: weights alone), more, and its tensors."""
+
+    described: dict[str, Any]
+    config: dict[str, Any] | None
+    extra: dict[str, Any]
+    tensors: dict[str, Tensor]
+
+
+def _read(path: Path) -> _Contents:
+    """The contents of a file that ``save`` wrote, on the CPU; its checksum is verified if it has one."""
     try:
-        with safe_open(path, framework="pt", device=str(device)) as file:
+        with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
     except SafetensorError as error:
         raise ValueError(f"{path}: not a safetensors file, or a damaged one ({error})") from error
     if metadata.get("format") not in (FORMAT, DAN_ONLY):
         raise ValueError(f"{path}: expected format {FORMAT!r} in its metadata, got {metadata.get('format')!r}")
-    return metadata, tensors
+    if "checksum" in metadata and metadata["checksum"] != _checksum(metadata, tensors):  # older files have none
+        raise ValueError(f"{path}: damaged: its checksum does not fit")
+    try:
+        config = json.loads(metadata["config"])
+        if metadata["format"] == FORMAT:
+            described = json.loads(metadata["network"])
+        else:
+            described = {"factory": None} if config is None else {"name": "dan"}
+        extra = json.loads(metadata.get("extra", "{}"))
+    except (KeyError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: bad metadata ({type(error).__name__}: {error})") from error
+    for key, value in (("network", described), ("config", config), ("extra", extra)):
+        if not isinstance(value, dict) and not (key == "config" and value is None):
+            raise ValueError(f"{path}: bad metadata: {key} must be a JSON object, got {value!r}")
+    return _Contents(described, config, extra, tensors)
+
+
+def _checksum(metadata: Mapping[str, str], tensors: Mapping[str, Tensor]) -> str:
+    """SHA-256 over the metadata, and over the names, dtypes, shapes and values of the tensors."""
+    described = {key: value for key, value in metadata.items() if key != "checksum"}
+    digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
+    for name, tensor in sorted(tensors.items()):
+        digest.update(json.dumps([name, str(tensor.dtype), list(tensor.shape)]).encode())
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
+def _check_finite(network: nn.Module, tensors: Mapping[str, Tensor]) -> None:
+    """Raise ValueError if a parameter's values are not finite. Buffers may hold infinity, as masks do."""
+    for name, _ in network.named_parameters():
+        if name in tensors and not tensors[name].isfinite().all():
+            raise ValueError(f"the parameter {name!r} holds NaN or infinity: the training behind it has diverged")

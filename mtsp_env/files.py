@@ -1,34 +1,16 @@
-"""Instances and tours as JSON files, and the atomic write with which all packages write files."""
+"""Instances and tours as JSON files."""
 
 from __future__ import annotations
 
 import json
 import math
 import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from mtsp_env.instance import FIELDS, Instance, Tours
-
-
-@contextmanager
-def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
-    """Give a temporary path in the folder of ``path``; the file written there replaces ``path`` when the block ends.
-
-    If the block raises an error, or the process dies, an existing file stays as it was.
-
-    >>> with atomic_write("tours.json") as temporary:
-    ...     temporary.write_text("{}")
-    """
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+from mtsp_env.writing import atomic_write
 
 
 def write_json(path: str | os.PathLike, data: dict) -> None:

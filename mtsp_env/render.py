@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mtsp_env.files import atomic_write
 from mtsp_env.instance import Instance
 from mtsp_env.tours import path_lengths
+from mtsp_env.writing import atomic_write
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,8 +6,12 @@ from pathlib import Path
 os.environ["MPLBACKEND"] = "Agg"  # before anything imports matplotlib
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from mtsp_env import Instance, write_instance
+
+# For `make fuzz`. Tests in tests/fuzz say nothing about max_examples, so that a profile decides: by default 100.
+settings.register_profile("fuzz", max_examples=10_000, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
 @pytest.fixture

@@ -13,6 +13,11 @@ from pathlib import Path
 from benchmarks.solvers import Answer, NoTours, Unavailable
 
 FOLDER = "MISBEHAVING_FOLDER"  # environment variable: folder to which ``hangs`` writes the numbers of its processes
+SLEEP = [sys.executable, "-c", "import time; time.sleep(600)"]
+LEAVE_AN_ORPHAN = f"""
+import subprocess
+print(subprocess.Popen({SLEEP}, start_new_session=True, stdout=subprocess.DEVNULL).pid)
+"""
 calls = 0
 
 
@@ -29,14 +34,16 @@ def proves(instance, seconds, seed):
 
 
 def hangs(instance, seconds, seed):
-    """Hang with a child process and ignore polite signals, unless the folder has a file "behave"."""
+    """Hang with children, two of them in sessions of their own, and ignore polite signals; not if "behave" exists."""
     folder = Path(os.environ[FOLDER])
     if instance.name in ("warm-up", "8x2-0", "8x2-1") or (folder / "behave").exists():
         return deals(instance, seconds, seed)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
-    (folder / f"{instance.name}.tmp").write_text(f"{os.getpid()} {child.pid}")
+    child = subprocess.Popen(SLEEP)
+    outsider = subprocess.Popen(SLEEP, start_new_session=True)
+    orphan = int(subprocess.run([sys.executable, "-c", LEAVE_AN_ORPHAN], stdout=subprocess.PIPE).stdout)
+    (folder / f"{instance.name}.tmp").write_text(f"{os.getpid()} {child.pid} {outsider.pid} {orphan}")
     (folder / f"{instance.name}.tmp").rename(folder / f"{instance.name}.pids")
     while True:
         time.sleep(600)

@@ -7,8 +7,8 @@ from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from dan_policy import DAN, DANConfig, make_actor
-from dan_policy.actor import as_actor, network_keys
+from dan_policy import DAN, DANConfig, make_actor, rollout
+from dan_policy.actor import FiniteCategorical, as_actor, network_keys
 from mtsp_env.batched import BatchedMTSP
 
 SMALL = DANConfig(embed_dim=16, feedforward_dim=32, n_heads=2, city_layers=1, prune_visited=True)
@@ -108,3 +108,18 @@ def test_torchrls_collector_gathers_whole_episodes(network):
         assert batch.shape == (4, cap)
         assert (batch["game", "decisions"][:, 0] == 0).all() and batch["next", "done"].any(1).all()
         assert batch["action_mask"].gather(2, batch["action"][..., None]).all()
+
+
+@pytest.mark.parametrize("decode", ["greedy", "sample"])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_logits_that_are_not_finite_are_named_and_masked_ones_do_not_matter(decode, value):
+    def first_city_is_odd(cities, agents, visited):
+        logits = -cities.norm(dim=-1)
+        logits[..., 1] = value
+        return logits
+
+    env = BatchedMTSP(n_nodes=6, n_agents=2, batch_size=3, seed=0)
+    with pytest.raises(ValueError, match=r"logits must be finite, got (nan|inf): parameters of the network may be NaN"):
+        rollout(first_city_is_odd, env, decode)
+    logits, mask = torch.tensor([[value, 0.0, -torch.inf]]), torch.tensor([[False, True, True]])
+    assert FiniteCategorical(logits, mask=mask).probs.tolist() == [[0.0, 1.0, 0.0]]

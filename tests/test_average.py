@@ -1,9 +1,11 @@
 """Averaged weights are the mean, name their sources, and are validated as during a run."""
 
-from dataclasses import replace
+import json
+from dataclasses import asdict, replace
 
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from dan_policy import DAN, DANConfig, load, save
 from dan_policy.registry import load_extra
@@ -40,6 +42,14 @@ def test_validation_is_that_of_the_runs(files, tmp_path, capsys):
     assert float(cost) == pytest.approx(run.best, abs=1e-4) and file.endswith("best.safetensors")
     assert main(["validate", str(tmp_path / "none.safetensors")]) == main(["validate"]) == 2
     assert "name at least 1 file to validate" in capsys.readouterr().err
+
+
+def test_files_without_extra_data_are_averaged(files, tmp_path):
+    kept = {"format": "dan-policy-1", "config": json.dumps(asdict(SMALL))}
+    save_file(load(files[0]).state_dict(), files[0], kept)
+    out = tmp_path / "mean.safetensors"
+    assert main(["average", *files, "--out", str(out)]) == 0
+    assert load_extra(out) == {"averaged": [{}, {"step": "b"}]}
 
 
 def test_what_cannot_be_averaged_is_refused(files, tmp_path, capsys):

@@ -163,9 +163,9 @@ def test_official_has_the_published_size():
     ("kwargs", "message"),
     [
         ({"n_heads": 3}, "n_heads must divide embed_dim=128, got 3"),
-        ({"city_layers": 0}, "city_layers must be a whole number of at least 1, got 0"),
+        ({"city_layers": 0}, "city_layers must be a whole number from 1 to 1000, got 0"),
         ({"encoder_norm": "batch"}, "unknown norm 'batch'"),
-        ({"tanh_clip": 0.0}, "tanh_clip must be above 0, got 0.0"),
+        ({"tanh_clip": 0.0}, "tanh_clip must be a number above 0 and at most 1e\\+06, got 0.0"),
         (
             {"view": 0, "prune_visited": True},
             "view must be None, or with prune_visited at least 1 city, got 0",

@@ -227,12 +227,14 @@ def test_resume_is_bit_identical(tmp_path, monkeypatch, student):
     def interrupted(self):
         logs = train_step(self)
         if self.step == 7:
-            signal.raise_signal(signal.SIGTERM)
+            signal.raise_signal(signal.SIGINT)
         return logs
 
     train_step = ImitationLearner.train_step
     monkeypatch.setattr(ImitationLearner, "train_step", interrupted)
-    assert imitate(replace(student, out=tmp_path / "parts")).step == 7
+    with pytest.raises(KeyboardInterrupt):
+        imitate(replace(student, out=tmp_path / "parts"))
+    assert checkpoint.read(tmp_path / "parts" / "checkpoint.pt")["progress"]["step"] == 7
     torch.manual_seed(123)  # something else happened in between
     assert imitate(replace(student, out=tmp_path / "parts", resume=True)).step == 24
     whole, parts = (checkpoint.read(tmp_path / name / "checkpoint.pt") for name in ("whole", "parts"))
@@ -279,6 +281,8 @@ def test_imitation_learns_what_the_teacher_does(tmp_path):
         ({"nodes_per_agent": 11}, r"nodes_per_agent must be at most n_nodes\[0\] // n_agents\[0\] = 10, got 11"),
         ({"sets_per_step": 17}, "sets_per_step must be at most buffer=16, got 17"),
         ({"passes": 0.0}, "passes must be above 0 and at most 1"),
+        ({"learning_rate": np.inf}, "learning_rate must be above 0 and at most 1, got inf"),
+        ({"weight_decay": np.nan}, "weight_decay must be finite and at least 0, got nan"),
         ({"average": 1.0}, "average must be at least 0 and below 1"),
     ],
 )

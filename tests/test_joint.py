@@ -175,8 +175,8 @@ def test_the_default_has_about_a_million_parameters():
     ("kwargs", "message"),
     [
         ({"n_heads": 3}, "n_heads must divide embed_dim=128, got 3"),
-        ({"n_layers": 0}, "n_layers must be a whole number of at least 1, got 0"),
-        ({"tanh_clip": 0.0}, "tanh_clip must be above 0, got 0.0"),
+        ({"n_layers": 0}, "n_layers must be a whole number from 1 to 1000, got 0"),
+        ({"tanh_clip": 0.0}, r"tanh_clip must be a number above 0 and at most 1e\+06, got 0.0"),
         ({"view": 0}, "view must be None or at least 1 city, got 0"),
     ],
 )

@@ -354,7 +354,7 @@ reads_what_does_not_exist.in_keys = ("weather",)
     ("policy", "message"),
     [
         (lambda cities, agents, visited: cities, r"logits of shape \(1, 6\), got \(1, 6, 2\)"),
-        (lambda cities, agents, visited: cities[..., 0] * torch.nan, "logits must be finite .*, got nan"),
+        (lambda cities, agents, visited: cities[..., 0] * torch.nan, "logits must be finite, got nan"),
         (lambda cities, agents, visited: cities[..., 0] - torch.inf, "logits must be finite .*, got -inf"),
         (reads_what_does_not_exist, "the network reads 'weather'; choose from .*'cities'.*'visits'"),
     ],

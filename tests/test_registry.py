@@ -1,13 +1,15 @@
 """Networks by name and on disk: what goes in comes out, nothing else is accepted, and files import no code."""
 
 import json
+import math
 import pickle
 import sys
+from dataclasses import fields
 
 import pytest
 import torch
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 from torch import nn
 
 from dan_policy import DAN, NETWORKS, DANConfig, build, load, registry, save
@@ -144,13 +146,17 @@ NAMED = '{"name": "dan"}'
     ("kept", "message"),
     [
         ({}, "expected format 'dan-policy-2' in its metadata, got None"),
-        ({"format": "dan-policy-1"}, "do not fit"),
-        ({"format": "dan-policy-1", "config": "{", "extra": "{}"}, "do not fit"),
+        ({"format": "dan-policy-1"}, "bad metadata .*config"),
+        ({"format": "dan-policy-1", "config": "{", "extra": "{}"}, "bad metadata .*JSONDecodeError"),
+        ({"format": "dan-policy-1", "config": "[1]"}, r"config must be a JSON object, got \[1\]"),
+        ({"format": "dan-policy-1", "config": "{}", "extra": "7"}, "extra must be a JSON object, got 7"),
+        ({"format": "dan-policy-1", "config": "[" * 10**5}, "bad metadata .*RecursionError"),
         ({"format": "dan-policy-1", "config": '{"depth": 3}', "extra": "{}"}, "do not fit"),
-        ({"format": "dan-policy-1", "config": json.dumps({"embed_dim": 32}), "extra": "{}"}, "do not fit"),
-        ({"format": "dan-policy-2", "config": "{}"}, "do not fit"),
-        ({"format": "dan-policy-2", "config": "{}", "network": "[]"}, "do not fit"),
+        ({"format": "dan-policy-1", "config": json.dumps({"embed_dim": 32}), "extra": "{}"}, "names and shapes"),
+        ({"format": "dan-policy-2", "config": "{}"}, "bad metadata .*network"),
+        ({"format": "dan-policy-2", "config": "{}", "network": "[]"}, r"network must be a JSON object, got \[\]"),
         ({"format": "dan-policy-2", "config": '{"depth": 3}', "network": NAMED}, "do not fit"),
+        ({"format": "dan-policy-2", "config": "{}", "network": '{"name": [1]}'}, "do not fit"),
         ({"format": "dan-policy-2", "config": "{}", "network": '{"name": "dax"}'}, "'dax', which is none of .*'dan'"),
     ],
 )
@@ -158,6 +164,82 @@ def test_other_safetensors_are_refused(tmp_path, kept, message):
     save_file(DAN(SMALL).state_dict(), tmp_path / "x", kept)
     with pytest.raises(ValueError, match=message):
         load(tmp_path / "x")
+
+
+def test_a_changed_tensor_or_configuration_is_noticed(file):
+    kept = metadata(file)
+    tensors = load_file(file)
+    name = "embed_city.weight"
+    assert len(kept["checksum"]) == 64
+    changes = {
+        "value": (kept, tensors | {name: tensors[name] + 1e-3}),
+        "dtype": (kept, tensors | {name: tensors[name].half()}),
+        "name": (kept, {("x" if key == name else key): value for key, value in tensors.items()}),
+        "config": (kept | {"config": kept["config"].replace("10.0", "11.0")}, tensors),
+        "extra": (kept | {"extra": '{"steps": 8}'}, tensors),
+        "checksum": (kept | {"checksum": "0" * 64}, tensors),
+    }
+    assert changes["config"][0] != kept
+    for changed, values in changes.values():
+        save_file(values, file, changed)
+        with pytest.raises(ValueError, match="its checksum does not fit"):
+            load(file)
+    save_file(tensors, file, {key: value for key, value in kept.items() if key != "checksum"})
+    assert load(file).config == SMALL  # as older versions wrote it
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_parameters_that_are_not_finite_are_neither_saved_nor_loaded(tmp_path, file, value):
+    network = DAN(SMALL)
+    with torch.no_grad():
+        network.embed_city.bias[3] = value
+    with pytest.raises(ValueError, match=r"'embed_city\.bias' holds NaN or infinity"):
+        save(tmp_path / "a", network)
+    assert not (tmp_path / "a").exists()
+    kept = {key: text for key, text in metadata(file).items() if key != "checksum"}
+    save_file(network.state_dict(), tmp_path / "a", kept)
+    healthy = DAN(SMALL)
+    before = {key: weight.clone() for key, weight in healthy.state_dict().items()}
+    for target in (None, healthy):
+        with pytest.raises(ValueError, match=r"a: .*'embed_city\.bias' holds NaN or infinity"):
+            load(tmp_path / "a", network=target)
+    assert all(torch.equal(before[key], weight) for key, weight in healthy.state_dict().items())
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_absurd_configurations_are_refused_before_anything_is_built(tmp_path, name, monkeypatch):
+    """Every size and clip of every network of the registry; ``view`` costs nothing."""
+    kind = NETWORKS[name]
+    save(tmp_path / "a", build(name, {"embed_dim": 16, "n_heads": 2}))
+    kept, tensors = metadata(tmp_path / "a"), load_file(tmp_path / "a")
+    kept.pop("checksum")
+    monkeypatch.setitem(NETWORKS, name, registry.NetworkType(kind.config, lambda config: pytest.fail("it was built")))
+    for field in fields(kind.config):
+        for value in (10**7, 20_000.5, math.inf, math.nan, -1, "7", [], None):
+            if field.name == "view" and value in (10**7, None):
+                continue
+            config = json.loads(kept["config"]) | {field.name: value}
+            save_file(tensors, tmp_path / "a", kept | {"config": json.dumps(config)})
+            if field.name == "tanh_clip" and value == 20_000.5:
+                continue
+            with pytest.raises(
+                ValueError, match=rf"a: weights and network do not fit \(.*{field.name.partition('_')[2]}"
+            ):
+                load(tmp_path / "a")
+
+
+def test_wide_networks_take_no_memory_before_the_tensors_are_compared(tmp_path, file):
+    """10^12 parameters would take 4 TB."""
+    config = {"embed_dim": 16_384, "feedforward_dim": 16_384, "city_layers": 1000, "n_heads": 1}
+    save_file(load_file(file), tmp_path / "a", {"format": "dan-policy-1", "config": json.dumps(config)})
+    with pytest.raises(ValueError, match="its tensors do not have the names and shapes of the network 'dan'"):
+        load(tmp_path / "a")
+
+
+@pytest.mark.parametrize("device", ["meta", "cpu:99", "nowhere", "hpu"])
+def test_devices_that_cannot_compute_are_named(file, device):
+    with pytest.raises(ValueError, match=f"no device '{device}' here; choose for example 'cpu'"):
+        load(file, device)
 
 
 # Networks of one's own

@@ -1,6 +1,7 @@
 """What a training run writes, how it is resumed bit for bit, and what it refuses."""
 
 import signal
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from tiny import TINY
 from benchmarks.policies.attention_model import AttentionModel
 from dan_policy import load
 from train import checkpoint
+from train.__main__ import main
 from train.checkpoint import check_same_run
 from train.config import ReinforceConfig
 from train.reinforce import ReinforceLearner, reinforce
@@ -42,7 +44,8 @@ def test_an_interrupt_finishes_the_step_and_saves(tmp_path, monkeypatch):
     train_step = ReinforceLearner.train_step
     monkeypatch.setattr(ReinforceLearner, "train_step", step_then_interrupt)
     before = signal.getsignal(signal.SIGINT)
-    assert reinforce(replace(TINY, out=tmp_path, checkpoint_every=1000)).step == 3
+    with pytest.raises(KeyboardInterrupt):  # raised again, once everything is saved
+        reinforce(replace(TINY, out=tmp_path, checkpoint_every=1000))
     assert checkpoint.read(tmp_path / "checkpoint.pt")["progress"]["step"] == 3
     assert signal.getsignal(signal.SIGINT) is before
 
@@ -71,12 +74,67 @@ def test_a_checkpoint_may_be_older_than_an_option():
             check_same_run(older, changed)
 
 
-def test_a_damaged_checkpoint_is_refused(tmp_path):
+@pytest.mark.slow
+def test_a_damaged_checkpoint_can_be_replaced_by_the_one_before_it(tmp_path):
+    """The continuation logs every step once, and ends as the whole run would have ended."""
+    run = replace(TINY, out=tmp_path / "run", checkpoint_every=2, steps=6)
+    reinforce(replace(run, out=tmp_path / "whole"))
+    reinforce(replace(run, steps=5))  # checkpoints at 2, 4 and 5
+    path = tmp_path / "run" / "checkpoint.pt"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"its checksum does not fit.*: mv "):
+        reinforce(replace(run, resume=True))
+    checkpoint.previous(path).replace(path)
+    assert checkpoint.read(path)["progress"]["step"] == 4
+    reinforce(replace(run, resume=True))
+    whole, again = (checkpoint.read(tmp_path / name / "checkpoint.pt") for name in ("whole", "run"))
+    assert same(whole["network"], again["network"])
+    for name in ("cost", "validation_cost"):
+        logs = [np.loadtxt(tmp_path / part / f"logs/scalars/{name}.csv", delimiter=",") for part in ("whole", "run")]
+        assert np.array_equal(*logs), name
+
+
+@pytest.mark.parametrize("lacks", ["config", "network", "random", "progress", "optimiser", "baseline"])
+def test_a_checkpoint_that_lacks_a_part_is_refused(tmp_path, lacks):
+    run = replace(TINY, out=tmp_path, steps=1)
+    learner = ReinforceLearner(run)
+    learner.save()
     path = tmp_path / "checkpoint.pt"
-    checkpoint.write(path, {"a": torch.zeros(1000)})
-    path.write_bytes(path.read_bytes()[:500])
-    with pytest.raises(ValueError, match="not a checkpoint, or a damaged one"):
-        checkpoint.read(path)
+    state = checkpoint.read(path)
+    del state[lacks]
+    checkpoint.write(path, state)
+    with pytest.raises(ValueError, match=f"does not hold the state of a ReinforceLearner .*{lacks}"):
+        reinforce(replace(run, resume=True))
+
+
+def test_one_run_at_a_time_writes_to_a_folder(tmp_path, monkeypatch):
+    run = replace(TINY, out=tmp_path, steps=1)
+
+    def start_another():
+        with pytest.raises(ValueError, match="another run is writing to it"):
+            reinforce(run)
+        refused.append(True)
+
+    def train_step(self):
+        other = threading.Thread(target=start_another)
+        other.start()
+        other.join()
+        return step(self)
+
+    step, refused = ReinforceLearner.train_step, []
+    monkeypatch.setattr(ReinforceLearner, "train_step", train_step)
+    reinforce(run)
+    assert refused == [True]
+    with pytest.raises(FileExistsError, match="add --resume"):
+        reinforce(run)
+
+
+def test_what_a_killed_run_left_is_removed(tmp_path):
+    (tmp_path / ".checkpoint.pt.0123.tmp").write_text("half")
+    reinforce(replace(TINY, out=tmp_path, steps=1))
+    assert not list(tmp_path.glob(".*.tmp"))
 
 
 def test_logs_and_weights_are_written(tmp_path):
@@ -99,6 +157,34 @@ def test_a_custom_network_is_trained_saved_and_continued(tmp_path):
         ReinforceLearner(replace(TINY, init=str(tmp_path / "last.safetensors")))
     with pytest.raises(ValueError, match=r"package.module:factory, got 'nothing.here:at_all'"):
         ReinforceLearner(replace(TINY, policy="nothing.here:at_all"))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"policy": "os:getcwd"}, "os:getcwd must return a module or a function, got str"),
+        ({"policy": "torch.nn:Identity"}, "policy='torch.nn:Identity' has no parameters to train"),
+        (
+            {"policy": "torch.nn:Linear", "policy_options": {"in_features": 2, "out_features": 2}},
+            "policy='torch.nn:Linear' fails on an observation .*takes 2 positional arguments",
+        ),
+        ({"distribution": "os:getcwd"}, "distribution='os:getcwd' cannot be drawn from .*takes no arguments"),
+        ({"device": "meta"}, "no device 'meta' here"),
+        ({"device": "cpu:99"}, "no device 'cpu:99' here"),
+    ],
+)
+def test_what_cannot_be_trained_is_named(options, message):
+    with pytest.raises(ValueError, match=message):
+        ReinforceLearner(replace(TINY, **options))
+
+
+def test_a_lack_of_memory_is_one_line(tmp_path, capsys):
+    for option in (["--batch-size", "100000000000"], ["--validation-instances", "100000000000"]):
+        command = ["reinforce", "quick", "--steps", "1", "--network.embed-dim", "16", "--challenge-instances", "2"]
+        command += ["--validation-instances", "2", "--no-tensorboard", "--out", str(tmp_path / option[0]), *option]
+        assert main(command) == 2
+        printed = capsys.readouterr().err
+        assert printed.startswith("train: error: out of memory (") and printed.count("\n") == 1
 
 
 def test_dropping_visited_cities_can_be_switched_on_and_off_with_the_same_weights(tmp_path):

@@ -275,6 +275,17 @@ def test_training_lowers_the_greedy_cost_on_held_out_instances(tmp_path):
         ({"n_agents": (3, 2)}, r"n_agents\[1\] must be a whole number of at least 3, got 2"),
         ({"batch_size": 0}, "batch_size must be a whole number of at least 1, got 0"),
         ({"learning_rate": 0.0}, "learning_rate must be above 0"),
+        ({"learning_rate": 1e30}, r"learning_rate must be above 0 and at most 1, got 1e\+30"),
+        ({"learning_rate": np.inf}, "learning_rate must be above 0 and at most 1, got inf"),
+        ({"decay": 1.5}, "decay must be above 0 and at most 1, got 1.5"),
+        ({"seconds": 0.0}, "seconds must be a finite number of seconds above 0, got 0.0"),
+        ({"seconds": np.nan}, "seconds must be a finite number of seconds above 0, got nan"),
+        ({"threads": -1}, "threads must be None or from 1 to 1024, got -1"),
+        ({"threads": 10**6}, "threads must be None or from 1 to 1024, got 1000000"),
+        ({"seed": -1}, r"seed must be at least 0 and below 2\^63, got -1"),
+        ({"seed": 2**63}, "seed must be at least 0"),
+        ({"normalise": True, "batch_size": 1}, "normalise needs at least 2 episodes per step: raise batch_size=1"),
+        ({"normalise": True, "batch_tokens": 199}, "normalise needs at least 2 episodes per step: .*batch_tokens=199"),
         ({"decisions": 0.0}, "decisions must be above 0 and at most 1, got 0.0"),
         ({"challenge_p": 1.0}, "challenge_p must lie between 0 and 1"),
         ({"seconds": -1.0}, "seconds must be .*, got -1.0"),
@@ -289,6 +300,16 @@ def test_training_lowers_the_greedy_cost_on_held_out_instances(tmp_path):
 def test_bad_configurations_are_named(kwargs, message):
     with pytest.raises(ValueError, match=message):
         ReinforceConfig(**kwargs)
+
+
+def test_a_gradient_that_is_not_finite_changes_nothing(tmp_path, capsys, monkeypatch):
+    learner = ReinforceLearner(replace(TINY, out=tmp_path))
+    before = {name: weight.clone() for name, weight in learner.network.state_dict().items()}
+    value = learner.baseline.value
+    monkeypatch.setattr(learner.baseline, "value", lambda *arguments: value(*arguments) * torch.inf)
+    with pytest.raises(FloatingPointError, match=r"step 1: the norm of the gradient is (nan|inf)\. .*lower"):
+        learner.train_step()
+    assert learner.step == 0 and same(dict(learner.network.state_dict()), before)
 
 
 def test_presets_follow_the_paper():

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import os
 import sys
+from concurrent.futures import BrokenExecutor
+
+from train.interrupts import exit_on_signals
+
+if __name__ == "__main__":
+    exit_on_signals()  # before torch is imported, which takes seconds
 
 # Number of kernels that oneDNN caches; PyTorch reads it when it is loaded. Batches have many shapes, and building a
 # kernel takes milliseconds.
 os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "8192")
 
+import torch
 import tyro
 
 from train.average import average
@@ -22,13 +29,28 @@ for command in (imitate, reinforce, average, validate):
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run a command and return 0. Bad input prints one line to stderr and returns 2."""
+    """Run a command and return 0. Bad input, divergence and a lack of memory print one line to stderr and return 2."""
     try:
         app.cli(prog="python -m train", description="Train networks for the MinMax mTSP.", args=argv)
-    except (ValueError, OSError, ImportError) as error:
-        print(f"train: error: {error}", file=sys.stderr)
-        return 2
+    except (ValueError, OSError, ImportError, FloatingPointError) as error:
+        return _refuse(str(error))
+    except BrokenExecutor as error:
+        return _refuse(f"a process that makes labels has died, perhaps for lack of memory ({error})")
+    except (MemoryError, RuntimeError) as error:
+        if not _lacks_memory(error):
+            raise
+        return _refuse(f"out of memory ({error}): choose smaller batches, sets, instances or networks")
     return 0
+
+
+def _refuse(message: str) -> int:
+    print(f"train: error: {' '.join(message.split())}", file=sys.stderr)
+    return 2
+
+
+def _lacks_memory(error: Exception) -> bool:
+    """Whether Python, NumPy, a GPU, or PyTorch on a CPU, which has no error of its own, could not get memory."""
+    return isinstance(error, (MemoryError, torch.OutOfMemoryError)) or "DefaultCPUAllocator" in str(error)
 
 
 if __name__ == "__main__":

@@ -5,8 +5,11 @@ from __future__ import annotations
 import hashlib
 import multiprocessing
 import os
-from collections.abc import Sequence
+import signal
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import contextmanager
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -85,10 +88,11 @@ class Buffer:
             return demonstrate(self.config, index)
         if self._pool is None:
             spawn = multiprocessing.get_context("spawn")  # a fork of a process with threads may hang
-            self._pool = ProcessPoolExecutor(self.config.workers, spawn, _one_thread)
-        for ahead in range(index, index + 2 * self.config.workers + 1):
-            if ahead not in self._pending:
-                self._pending[ahead] = self._pool.submit(demonstrate, self.config, ahead)
+            self._pool = ProcessPoolExecutor(self.config.workers, spawn, _set_up_worker)
+        with _sigint_blocked():  # which workers inherit when they start: Ctrl-C is for the learning process
+            for ahead in range(index, index + 2 * self.config.workers + 1):
+                if ahead not in self._pending:
+                    self._pending[ahead] = self._pool.submit(demonstrate, self.config, ahead)
         return self._pending.pop(index).result()
 
     def state_dict(self) -> dict[str, Any]:
@@ -122,8 +126,26 @@ class Buffer:
             self._pending.clear()
 
 
-def _one_thread() -> None:
-    """Set up a worker: it shares the cores with the learning process and runs at a lower priority."""
+@contextmanager
+def _sigint_blocked() -> Iterator[None]:
+    """A context in which SIGINT waits."""
+    old = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, old)
+
+
+def _set_up_worker() -> None:
+    """A worker shares the cores with the learning process at a lower priority, and ends when that process does."""
+    Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(1)
     if hasattr(os, "nice"):
         os.nice(5)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None  # this runs in a worker
+    parent.join()
+    os._exit(1)

@@ -1,8 +1,14 @@
-"""The whole state of a training run in one file, replaced atomically, and the check that a run may continue from it."""
+"""The whole state of a training run in one file, replaced atomically, and the check that a run may continue from it.
+
+A file is ``MAGIC``, the SHA-256 of the rest, and what ``torch.save`` writes. Any change of any bit is noticed.
+"""
 
 from __future__ import annotations
 
-import pickle
+import hashlib
+import io
+import shutil
+import zipfile
 from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -10,8 +16,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from mtsp_env.files import atomic_write
+from mtsp_env.writing import atomic_write
 from train.config import RunConfig
+
+MAGIC = b"mtsp checkpoint\n"
+DIGEST_SIZE = hashlib.sha256().digest_size
 
 # Options that may differ between a run and its continuation; all others are part of what is being trained.
 FREE_ON_RESUME = (
@@ -29,25 +38,69 @@ FREE_ON_RESUME = (
 
 
 def write(path: Path, state: dict[str, Any]) -> None:
-    """Write tensors, numbers, strings, lists and dicts. If writing fails, the old file stays as it was."""
+    """Write tensors, numbers, strings, lists and dicts; the file that was there is kept as ``previous(path)``.
+
+    If writing fails, the old file stays as it was.
+    """
+    content = io.BytesIO()
+    torch.save(state, content)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(path) as temporary:
-        torch.save(state, temporary)
+    if path.exists():
+        with atomic_write(previous(path)) as temporary:
+            shutil.copyfile(path, temporary)
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
+        file.write(MAGIC + hashlib.sha256(content.getbuffer()).digest())
+        file.write(content.getbuffer())
+
+
+def previous(path: Path) -> Path:
+    """Where ``write`` keeps the checkpoint before the one at ``path``."""
+    return path.with_name(f"{path.stem}.previous{path.suffix}")
 
 
 def read(path: Path) -> dict[str, Any]:
     """Read what ``write`` wrote. No code in the file is executed.
 
+    Files without ``MAGIC``, which older versions wrote, are read if the checksums inside their ZIP archive fit. Those
+    cover the tensors, but not every byte of the file.
+
     Raises:
         FileNotFoundError: no such file.
-        ValueError: the file is not a checkpoint, or it is damaged.
+        ValueError: the file is not a checkpoint, or it is damaged; the message says how to go on.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no checkpoint at {path}")
     try:
-        return torch.load(path, weights_only=True, map_location="cpu")
-    except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError, ValueError) as error:
-        raise ValueError(f"{path}: not a checkpoint, or a damaged one ({error})") from error
+        state = torch.load(io.BytesIO(_verified(path.read_bytes())), weights_only=True, map_location="cpu")
+    except OSError:
+        raise
+    except Exception as error:  # whatever an unpickler meets in damaged bytes
+        reason = (str(error).splitlines() or [""])[0] or type(error).__name__
+        raise ValueError(f"{path}: not a checkpoint, or a damaged one ({reason}){_way_out(path)}") from error
+    if not isinstance(state, dict):
+        raise ValueError(f"{path}: not a checkpoint: it holds a {type(state).__name__}{_way_out(path)}")
+    return state
+
+
+def _verified(data: bytes) -> memoryview:
+    """The part of a file's content that ``torch.save`` wrote. Raises ValueError if a checksum does not fit."""
+    if data.startswith(MAGIC):
+        begin = len(MAGIC) + DIGEST_SIZE
+        content = memoryview(data)[begin:]
+        if hashlib.sha256(content).digest() != data[len(MAGIC) : begin]:
+            raise ValueError("its checksum does not fit")
+        return content
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        if (name := archive.testzip()) is not None:
+            raise ValueError(f"the checksum of its part {name!r} does not fit")
+    return memoryview(data)
+
+
+def _way_out(path: Path) -> str:
+    """What to do about a damaged checkpoint."""
+    if previous(path).is_file():
+        return f"; to continue from the checkpoint before it: mv {previous(path)} {path}"
+    return f"; start another run, from this one's weights if it has any: --init {path.with_name('last.safetensors')}"
 
 
 def random_state(rng: np.random.Generator) -> dict[str, Any]:

@@ -41,7 +41,10 @@ def draw(
     """
     n_nodes, n_agents = size or draw_size(rng, config)
     batch = batch if tokens is None else max(1, min(batch, tokens // n_nodes))
-    arrays = sample(config.generator(), rng, batch, n_nodes, n_agents).arrays
+    try:
+        arrays = sample(config.generator(), rng, batch, n_nodes, n_agents).arrays
+    except TypeError as error:  # a function of the user's that takes or returns something else
+        raise ValueError(f"distribution={config.distribution!r} cannot be drawn from ({error})") from error
     return Problem(n_agents, {name: torch.as_tensor(array, device=config.device) for name, array in arrays.items()})
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import pkgutil
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -91,6 +92,10 @@ class RunConfig:
         self._check_at_least(1, "steps", "nodes_per_agent", "validate_every", "checkpoint_every")
         self._check_at_least(2, "validation_instances")
         self._check_positive("max_grad_norm", "speed")
+        if not 0 <= self.seed < 2**63:
+            raise ValueError(f"seed must be at least 0 and below 2^63, got {self.seed!r}")
+        if self.threads is not None and not 1 <= self.threads <= 1024:  # far more would crash PyTorch
+            raise ValueError(f"threads must be None or from 1 to 1024, got {self.threads!r}")
         if self.seconds is not None:
             check_seconds("seconds", self.seconds)
         self._check_policy()
@@ -121,6 +126,11 @@ class RunConfig:
         for name in names:
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be above 0, got {getattr(self, name)!r}")
+
+    def _check_share(self, *names: str) -> None:
+        for name in names:
+            if not 0 < getattr(self, name) <= 1:
+                raise ValueError(f"{name} must be above 0 and at most 1, got {getattr(self, name)!r}")
 
     @property
     def registered(self) -> bool:
@@ -206,16 +216,27 @@ class ReinforceConfig(RunConfig):
         self._check_at_least(1, "batch_size", "chunk", "decay_every", "challenge_every", "ray_workers")
         self._check_at_least(2, "challenge_instances")
         self._check_at_least(2 if self.baseline == "shared" else 1, "samples")
-        self._check_positive("learning_rate", "decay")
+        self._check_share("learning_rate", "decay")
         if self.batch_tokens is not None:
             self._check_at_least(1, "batch_tokens")
         for stage in self.curriculum:
             check_count("curriculum: first step", stage[0], 0)
             self._at_stage(stage)  # which checks the ranges
-        if not 0 < self.decisions <= 1:
-            raise ValueError(f"decisions must be above 0 and at most 1, got {self.decisions!r}")
+        self._check_share("decisions")
+        if self.normalise:
+            self._check_normalised()
         if not 0 < self.challenge_p < 1:
             raise ValueError(f"challenge_p must lie between 0 and 1, got {self.challenge_p!r}")
+
+    def _check_normalised(self) -> None:
+        """A single episode has no standard deviation."""
+        greatest_n = max([self.n_nodes[1], *(stage[2] for stage in self.curriculum)])
+        least_batch = min(self.batch_size, (self.batch_tokens or self.batch_size * greatest_n) // greatest_n)
+        if max(1, least_batch) * self.samples < 2:
+            raise ValueError(
+                f"normalise needs at least 2 episodes per step: raise batch_size={self.batch_size}, "
+                f"batch_tokens={self.batch_tokens} or samples={self.samples}"
+            )
 
     def at(self, step: int) -> ReinforceConfig:
         """The configuration with the ranges of the curriculum's stage at ``step``."""
@@ -301,19 +322,16 @@ class ImitateConfig(RunConfig):
         super().__post_init__()
         self._check_at_least(1, "set_tokens", "buffer", "sets_per_step", "teacher_iterations", "warmup")
         self._check_at_least(0, "workers")
-        self._check_positive("learning_rate")
+        self._check_share("learning_rate")
         if self.depot != "final":
             raise ValueError(f"depot must be 'final' (the teacher's agents never leave twice), got {self.depot!r}")
         if self.n_nodes[0] <= self.n_agents[0]:
             raise ValueError(f"n_nodes[0] must be above n_agents[0]={self.n_agents[0]}, got {self.n_nodes[0]}")
         if self.sets_per_step > self.buffer:
             raise ValueError(f"sets_per_step must be at most buffer={self.buffer}, got {self.sets_per_step}")
-        if not 0 < self.passes <= 1:
-            raise ValueError(f"passes must be above 0 and at most 1, got {self.passes!r}")
-        if not 0 < self.final_rate <= 1:
-            raise ValueError(f"final_rate must be above 0 and at most 1, got {self.final_rate!r}")
+        self._check_share("passes", "final_rate")
         for name in ("weight_decay", "next_weight", "assignment_weight"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must be at least 0, got {getattr(self, name)!r}")
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be finite and at least 0, got {getattr(self, name)!r}")
         if self.anneal_seconds is not None:
             check_seconds("anneal_seconds", self.anneal_seconds)

@@ -18,7 +18,7 @@ from train.buffer import Buffer
 from train.collect import autocast
 from train.config import ImitateConfig
 from train.learner import Learner
-from train.loop import check_folder, run
+from train.loop import run, run_folder
 from train.loss import log_probs
 from train.network import observation_keys
 from train.plans import plan_losses
@@ -54,10 +54,7 @@ class ImitationLearner(Learner):
             next_loss = next_loss + part.next.detach() / len(batches)
             assignment_loss = assignment_loss + part.assignment.detach() / len(batches)
             agreed = agreed + part.agreed
-        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.max_grad_norm)
-        self.optimiser.step()
-        self.schedule.step()
-        self.average.update_parameters(self.network)
+        norm = self.update()
 
         self.step += 1
         self.instances = self.buffer.instances
@@ -67,7 +64,7 @@ class ImitationLearner(Learner):
             "next_loss": float(next_loss),
             "assignment_loss": float(assignment_loss),
             "agreement": float(agreed) / count,
-            "grad_norm": float(norm),
+            "grad_norm": norm,
             "learning_rate": float(self.schedule.get_last_lr()[0]),
             "decisions_per_second": count / (time.perf_counter() - start),
             "seconds_waited": waited,
@@ -149,14 +146,15 @@ def imitate(config: Annotated[ImitateConfig, tyro.conf.arg(name="")]) -> Imitati
     Raises:
         FileExistsError: ``config.out`` holds another run and ``resume`` is not set.
         ModuleNotFoundError: Numba, which the teacher needs, is not installed.
-        ValueError: the run to resume had another configuration, or a value does not fit.
+        ValueError: the run to resume had another configuration, a value does not fit, or another process trains in
+            ``config.out``.
         OSError: there is no run to resume, or no such weights.
     """
     import mtsp_env.reference  # noqa: F401 (fail now if Numba is missing, not in a worker)
 
-    check_folder(config)
     if config.roll_in is not None:
         find(config.roll_in)  # fail now if there are no such weights
-    learner = ImitationLearner(config)
-    run(learner)
+    with run_folder(config):
+        learner = ImitationLearner(config)
+        run(learner)
     return learner

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from dan_policy.episode import find_device
 from train import checkpoint
 from train.collect import costs, draw_set
 from train.config import RunConfig
-from train.distributed import rank, world_size
+from train.distributed import gather, rank, world_size
 from train.network import make_network, save_weights
 
 VALIDATION_SEED = 987_654_321  # the same held-out instances in every run; training never uses it
@@ -33,15 +34,20 @@ class Learner(ABC):
         instances: number of instances so far, over all processes.
         seconds: time spent in training and validation so far.
         best: lowest validation cost so far.
+        optimiser, schedule: set by each kind of training.
     """
+
+    optimiser: torch.optim.Optimizer
+    schedule: torch.optim.lr_scheduler.LRScheduler
 
     def __init__(self, config: RunConfig):
         self.config = config
-        if config.threads:
+        device = find_device(config.device)
+        if config.threads is not None:
             torch.set_num_threads(config.threads)
         torch.manual_seed(config.seed)
         self.rng = np.random.default_rng(config.seed)
-        self.network = make_network(config).to(find_device(config.device)).train()
+        self.network = make_network(config).to(device).train()
         if world_size() > 1:  # all processes start with the same network, then draw instances and actions of their own
             torch.manual_seed(config.seed + rank())
             self.rng = np.random.default_rng([config.seed, rank()])
@@ -52,6 +58,24 @@ class Learner(ABC):
     @abstractmethod
     def train_step(self) -> dict[str, float]:
         """Take one optimiser step and count it in ``step`` and ``instances``. Returns the numbers to log."""
+
+    def update(self) -> float:
+        """Let the optimiser take its step, then the schedule and the running average. Returns the gradient's norm.
+
+        Raises:
+            FloatingPointError: the gradient, and hence probably the loss, is not finite. The weights stay as they were.
+        """
+        norm = float(torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.max_grad_norm))
+        if not math.isfinite(norm):
+            rate = self.schedule.get_last_lr()[0]
+            raise FloatingPointError(
+                f"step {self.step + 1}: the norm of the gradient is {norm}. Training has diverged: lower the learning "
+                f"rate, which was {rate:g}. {self.config.out} has the weights of the last checkpoint, if there is one"
+            )
+        self.optimiser.step()
+        self.schedule.step()
+        self.average.update_parameters(self.network)
+        return norm
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
@@ -101,16 +125,37 @@ class Learner(ABC):
 
         Raises:
             FileNotFoundError: there is none.
-            ValueError: it is damaged, or of a run with another configuration.
+            ValueError: it is damaged, of a run with another configuration, or of another step than those of others.
         """
-        state = checkpoint.read(checkpoint_path(self.config))
-        checkpoint.check_same_run(state["config"], self.config)
-        self.network.load_state_dict(state["network"])
-        self.average.load_state_dict(state["average"])
-        self.load_state_dict(state)
-        for name, value in state["progress"].items():
-            setattr(self, name, value)
-        checkpoint.set_random_state(self.rng, state["random"])
+        path = checkpoint_path(self.config)
+        try:
+            state = self._common_state(path)
+            checkpoint.check_same_run(state["config"], self.config)
+            self.network.load_state_dict(state["network"])
+            self.average.load_state_dict(state["average"])
+            self.load_state_dict(state)
+            for name in ("step", "instances", "seconds", "best"):
+                setattr(self, name, state["progress"][name])
+            checkpoint.set_random_state(self.rng, state["random"])
+        except BrokenExecutor:  # a process that makes labels has died
+            raise
+        except (LookupError, TypeError, AttributeError, RuntimeError) as error:
+            reason = f"{type(error).__name__}: {error}"
+            raise ValueError(f"{path}: it does not hold the state of a {type(self).__name__} ({reason})") from error
+
+    def _common_state(self, path: Path) -> dict[str, Any]:
+        """The checkpoint at ``path``, or the one before it if another process has not come as far.
+
+        Processes that train together are at the same step when they save, but one may be killed before it has saved.
+        """
+        state = checkpoint.read(path)
+        step = torch.tensor([state["progress"]["step"]], device=self.config.device)
+        earliest = int(gather(step).min())
+        if int(step) > earliest and checkpoint.previous(path).is_file():
+            state = checkpoint.read(checkpoint.previous(path))
+        if state["progress"]["step"] != earliest:
+            raise ValueError(f"{path} is of step {int(step)}, but another process has saved step {earliest} last")
+        return state
 
 
 def checkpoint_path(config: RunConfig) -> Path:

@@ -6,68 +6,81 @@ import math
 import signal
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, nullcontext
 
-from torchrl.record import CSVLogger, TensorboardLogger
-
+from mtsp_env.writing import lock, remove_leftovers
 from train.config import RunConfig
 from train.distributed import any_process, rank
+from train.interrupts import postponed
 from train.learner import Learner, checkpoint_path
+from train.logs import Logs
 from train.progress import progress
 
 
-def check_folder(config: RunConfig) -> None:
-    """Raise FileExistsError if ``config.out`` holds another run and ``resume`` is not set."""
+@contextmanager
+def run_folder(config: RunConfig) -> Iterator[None]:
+    """A context in which no other process may train in ``config.out``.
+
+    Raises:
+        FileExistsError: it holds another run, and ``resume`` is not set.
+        FileNotFoundError: there is no run to resume.
+        OSError: the folder cannot be written.
+        ValueError: another process trains in it.
+    """
+    path = checkpoint_path(config)
+    if config.resume and not path.exists():
+        raise FileNotFoundError(f"no checkpoint at {path}")
+    if rank():  # under torchrun, process 0 holds the lock for all
+        _check_unused(config)
+        yield
+        return
+    config.out.mkdir(parents=True, exist_ok=True)
+    with open(config.out / ".lock", "a") as file:
+        try:
+            lock(file)
+        except BlockingIOError:
+            raise ValueError(f"{config.out}: another run is writing to it") from None
+        _check_unused(config)
+        remove_leftovers(config.out)
+        yield
+
+
+def _check_unused(config: RunConfig) -> None:
     if not config.resume and checkpoint_path(config).exists():
         raise FileExistsError(f"{config.out} holds a run already: add --resume to continue it, or choose another --out")
 
 
 def run(learner: Learner) -> None:
-    """Train until the configured steps or seconds are over, or until Ctrl-C; log, and save in any case."""
-    config = learner.config
-    if config.resume:
-        learner.restore()
-    first = rank() == 0
-    loggers = [CSVLogger("logs", str(config.out))] if first else []
-    if config.tensorboard and first:
-        loggers.append(TensorboardLogger("tensorboard", str(config.out)))
+    """Train until the configured steps or seconds are over, or until Ctrl-C or SIGTERM; log, and save in any case.
+
+    A signal that ends the run is raised again after everything is saved, for whoever handled it before.
+    """
+    with closing(learner):
+        if learner.config.resume:
+            learner.restore()
+        with postponed(signal.SIGINT, signal.SIGTERM) as caught:
+            _train(learner, caught)
+
+
+def _train(learner: Learner, caught: list[int]) -> None:
+    """Take steps until one of the run's limits is reached or a signal is ``caught``."""
+    config, first = learner.config, rank() == 0
     stop_at = learner.seconds + (config.seconds or math.inf)  # on the run's own clock, which is logged and saved
-    with progress(config.steps, learner.step, silent=not first) as show, _interrupts() as interrupted:
-        try:
-            while learner.step < config.steps:
-                if any_process(bool(interrupted) or learner.seconds >= stop_at, config.device):
-                    break
-                start = time.perf_counter()
-                logs = learner.train_step()
-                if learner.step % config.validate_every == 0 and first:
-                    logs["validation_cost"] = learner.validate()
-                learner.seconds += time.perf_counter() - start
-                if "validation_cost" in logs:
-                    logs["seconds"] = learner.seconds  # for curves over time, even of an interrupted run
-                for logger in loggers:
-                    for name, number in logs.items():
-                        logger.log_scalar(name, number, step=learner.step)
-                show(learner.step, logs | ({"best": learner.best} if learner.best < math.inf else {}))
-                if learner.step % config.checkpoint_every == 0:
-                    learner.save()
-            learner.save()
-        finally:
-            learner.close()
-
-
-@contextmanager
-def _interrupts() -> Iterator[list[int]]:
-    """Collect SIGINT and SIGTERM: the first ends the run after the current step, the second ends it at once."""
-    caught: list[int] = []
-
-    def handler(number: int, _frame: object) -> None:
-        if caught:
-            raise KeyboardInterrupt
-        caught.append(number)
-
-    old = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield caught
-    finally:
-        for number, previous in old.items():
-            signal.signal(number, previous)
+    logging = closing(Logs(config.out, learner.step, config.tensorboard)) if first else nullcontext()
+    with progress(config.steps, learner.step, silent=not first) as show, logging as logs:
+        while learner.step < config.steps:
+            if any_process(bool(caught) or learner.seconds >= stop_at, config.device):
+                break
+            start = time.perf_counter()
+            numbers = learner.train_step()
+            if learner.step % config.validate_every == 0 and first:
+                numbers["validation_cost"] = learner.validate()
+            learner.seconds += time.perf_counter() - start
+            if "validation_cost" in numbers:
+                numbers["seconds"] = learner.seconds  # for curves over time, even of an interrupted run
+            if logs is not None:
+                logs.write(learner.step, numbers)
+            show(learner.step, numbers | ({"best": learner.best} if learner.best < math.inf else {}))
+            if learner.step % config.checkpoint_every == 0:
+                learner.save()
+        learner.save()

@@ -7,10 +7,12 @@ from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import nn
 
 from dan_policy.actor import Key, make_actor
 from dan_policy.registry import NETWORKS, build, load, save
+from mtsp_env.batched import BatchedMTSP
 from train.config import ImitateConfig, RunConfig
 
 
@@ -19,10 +21,13 @@ def make_network(config: RunConfig) -> nn.Module:
 
     Raises:
         OSError: no such weights.
-        ValueError: no such factory, or weights that do not fit.
+        ValueError: no such factory, no network that plays, or weights that do not fit.
     """
     if config.init is None:
-        return build(config.policy, config.network_options())
+        network = build(config.policy, config.network_options())
+        if not config.registered:
+            _check_plays(network, config)
+        return network
     network = load_weights(config.init, config)
     if config.registered and not isinstance(network, NETWORKS[config.policy].module):
         raise ValueError(
@@ -30,6 +35,22 @@ def make_network(config: RunConfig) -> nn.Module:
             f"give another policy of {sorted(NETWORKS)}"
         )
     return network if config.prune_visited is None else _pruned(network, config)
+
+
+def _check_plays(network: nn.Module, config: RunConfig) -> None:
+    """Raise ValueError unless a network of the user's has parameters and returns logits for an observation."""
+    if not any(parameter.requires_grad for parameter in network.parameters()):
+        raise ValueError(f"policy={config.policy!r} has no parameters to train")
+    env = BatchedMTSP(4, 2, 2, seed=0)
+    try:
+        with torch.random.fork_rng(), torch.no_grad():  # the run draws the same numbers as without this check
+            logits = make_actor(network)(env.reset())["logits"]
+    except Exception as error:  # whatever the user's code does
+        raise ValueError(
+            f"policy={config.policy!r} fails on an observation ({type(error).__name__}: {error})"
+        ) from error
+    if logits.shape != (2, 4):
+        raise ValueError(f"policy={config.policy!r} must return logits (B, n) = (2, 4), got {tuple(logits.shape)}")
 
 
 def load_weights(path: str | os.PathLike, config: RunConfig) -> nn.Module:

@@ -15,7 +15,7 @@ from train.collect import autocast, draw, play, repeat
 from train.config import ReinforceConfig
 from train.distributed import average_gradients, processes, world_size
 from train.learner import Learner
-from train.loop import check_folder, run
+from train.loop import run, run_folder
 from train.loss import EpisodicReinforceLoss, backward, decisions_with_advantage, subsample
 from train.presets import Preset
 from train.remote import RayWorkers
@@ -51,17 +51,14 @@ class ReinforceLearner(Learner):
             loss = EpisodicReinforceLoss(make_actor(self.network), n_episodes=len(advantage))
             backward(loss, decisions, config.chunk)
         average_gradients(self.network)
-        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.max_grad_norm)
-        self.optimiser.step()
-        self.schedule.step()
-        self.average.update_parameters(self.network)
+        norm = self.update()
 
         self.step += 1
         self.instances += len(problem.nodes) // config.samples * world_size()
         logs: dict[str, float] = {
             "cost": -float(episode.reward.mean()),
             "baseline": -float(value.mean()),
-            "grad_norm": float(norm),
+            "grad_norm": norm,
             "learning_rate": float(self.schedule.get_last_lr()[0]),
             "episodes_per_second": len(advantage) * world_size() / (time.perf_counter() - start),
         }
@@ -107,13 +104,14 @@ def reinforce(config: Preset) -> ReinforceLearner:
 
     Raises:
         FileExistsError: ``config.out`` holds another run and ``resume`` is not set.
-        ValueError: the run to resume had another configuration, or a value does not fit.
+        ValueError: the run to resume had another configuration, a value does not fit, or another process trains in
+            ``config.out``.
         OSError: there is no run to resume, or no such weights.
     """
     with processes(config.device):
-        check_folder(config)
         if config.collector == "ray" and world_size() > 1:
             raise ValueError("collector must be 'here' under torchrun, got 'ray'")
-        learner = ReinforceLearner(config)
-        run(learner)
+        with run_folder(config):
+            learner = ReinforceLearner(config)
+            run(learner)
     return learner

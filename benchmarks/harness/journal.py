@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 from dataclasses import asdict
 from pathlib import Path
 
 from benchmarks.harness.rows import Row, parse_lines
+from mtsp_env.writing import lock
 
 
 class Journal:
@@ -18,16 +18,18 @@ class Journal:
 
     Raises:
         OSError: the file cannot be written.
-        ValueError: a damaged line before the last, a gzipped file, or another writer.
+        ValueError: a damaged line before the last, a gzipped file, a device or pipe, or another writer.
     """
 
     def __init__(self, path: Path) -> None:
+        if path.exists() and not path.is_file():
+            raise ValueError(f"{path}: rows are appended to regular files only")
         if path.suffix == ".gz":
             raise ValueError(f"{path}: rows are appended to plain files only; gzip it when it is complete")
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file = open(path, "a+b")  # noqa: SIM115 (closed by __exit__)
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(self._file)
             self._file.seek(0)
             whole_lines = self._file.read().rpartition(b"\n")[0]
             self._file.truncate(len(whole_lines) + 1 if whole_lines else 0)

@@ -18,6 +18,7 @@ from multiprocessing.connection import Pipe, wait
 from typing import Any
 
 from benchmarks.harness.jobs import Job, Limits
+from benchmarks.harness.processes import kill_descendants
 from benchmarks.harness.worker import READY
 
 ONE_THREAD = {
@@ -99,9 +100,11 @@ class WorkerProcess:
         return self._fail("timeout", f"killed {self.limits.grace:g} s after its limit of {limit:g} s")
 
     def kill(self) -> None:
-        """Kill the process and all its children."""
+        """Kill the process and all its descendants."""
         if self.process is not None:
             with suppress(ProcessLookupError, PermissionError):  # macOS refuses if only zombies are left
+                os.kill(self.process.pid, signal.SIGSTOP)  # it starts no more processes
+                kill_descendants(self.process.pid)
                 os.killpg(self.process.pid, signal.SIGKILL)
             self.process.wait()
             self.connection.close()

@@ -19,6 +19,7 @@ from threading import Thread
 from typing import Any
 
 from benchmarks import solvers
+from benchmarks.harness.processes import adopt_orphans, kill_descendants
 from mtsp_env.instance import Instance, Tours
 from mtsp_env.tours import check_tours, makespan
 
@@ -84,10 +85,11 @@ def _cpu_seconds() -> float:
 
 
 def _receive(connection: Connection, jobs: SimpleQueue) -> None:
-    """Queue the jobs that arrive. When the supervisor is gone, kill this process group, even if a solver is running."""
+    """Queue the jobs that arrive. When the supervisor is gone, end with all descendants, even in a solver."""
     with suppress(EOFError, OSError):
         while True:
             jobs.put(connection.recv())
+    kill_descendants(os.getpid())
     os.killpg(0, signal.SIGKILL)
 
 
@@ -95,6 +97,7 @@ def main(descriptor: int, core: int | None) -> None:
     """Solve the jobs that arrive on the connection with this file descriptor, on this core; never returns."""
     if core is not None:
         os.sched_setaffinity(0, {core})
+    adopt_orphans()
     connection, jobs, loaded = Connection(descriptor), SimpleQueue(), {}
     Thread(target=_receive, args=(connection, jobs), daemon=True).start()
     while True:

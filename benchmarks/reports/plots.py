@@ -12,7 +12,7 @@ from matplotlib.ticker import FuncFormatter, NullLocator
 from benchmarks.reports.statistics import Results, mean
 from benchmarks.solvers import SOLVERS
 from benchmarks.suite import AnyCell, Cell
-from mtsp_env.files import atomic_write
+from mtsp_env.writing import atomic_write
 
 # A colour and a marker for each method: warm colours for DAN, black for the reference, cold ones for the others
 STYLE = {
