@@ -37,7 +37,7 @@ def _register() -> None:
     """Make ``pettingzoo.make("aec", "mtsp/mtsp-v0")`` work where this PettingZoo has a registry (1.27 on)."""
     try:
         from pettingzoo import register
-    except ImportError:
+    except (ImportError, FileNotFoundError):  # it cannot be imported in a working directory that is gone
         return
     register("aec", "mtsp/mtsp-v0", entry_point="mtsp_env.mtsp_v0:env")
 

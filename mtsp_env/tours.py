@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -77,7 +79,7 @@ def check_prefixes(instance: Instance, prefixes: Sequence[Sequence[int]]) -> Tou
     """
     if len(prefixes) != instance.n_agents:
         raise ValueError(f"expected {instance.n_agents} prefixes, one per agent, got {len(prefixes)}")
-    lists = [[int(node) for node in prefix] for prefix in prefixes]
+    lists = [[_node_number(agent, node) for node in prefix] for agent, prefix in enumerate(prefixes)]
     seen: set[int] = set()
     for agent, prefix in enumerate(lists):
         if not prefix or prefix[0] != 0:
@@ -93,6 +95,16 @@ def check_prefixes(instance: Instance, prefixes: Sequence[Sequence[int]]) -> Tou
     if len(seen) < instance.n_nodes and all(map(is_closed, lists)):
         raise ValueError(f"all agents are home for good, and {instance.n_nodes - len(seen)} cities are left")
     return lists
+
+
+def _node_number(agent: int, node: Any) -> int:
+    try:
+        number = operator.index(node)
+    except TypeError:
+        number = None
+    if number is None or isinstance(node, (bool, np.bool_)):
+        raise ValueError(f"prefix {agent} must be a list of node numbers, got {node!r} in it")
+    return number
 
 
 def is_closed(prefix: Sequence[int]) -> bool:
