@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip
 INSTALL := $(PIP) install --quiet --constraint constraints.txt
 
-.PHONY: demo test test-fast fuzz lint types wheel clean
+.PHONY: demo test test-fast fuzz lint types wheel docs clean
 
 # Plans the tours of the examples with the shipped network and says where the pictures are.
 demo: $(VENV)/.demo
@@ -34,6 +34,10 @@ types: $(VENV)/.dev
 wheel: $(VENV)/.dev
 	$(BIN)/python -m build --wheel
 
+# The site, in docs/_build/html. Runs the notebooks, and fails on any warning.
+docs: $(VENV)/.dev
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -b html docs docs/_build/html
+
 # torch goes first and alone: pip then takes a CPU build if it finds one, and the packages after it accept that build.
 $(VENV)/.demo: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -47,4 +51,4 @@ $(VENV)/.dev: $(VENV)/.demo
 	touch $@
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info .coverage .coverage.* .mypy_cache .nox .pytest_cache .ruff_cache
+	rm -rf $(VENV) build dist docs/_build *.egg-info .coverage .coverage.* .mypy_cache .nox .pytest_cache .ruff_cache

@@ -21,7 +21,7 @@ from benchmarks import suite
 from benchmarks.files import write_text
 from benchmarks.harness.judge import read_judged
 from benchmarks.harness.rows import Row
-from benchmarks.suite import AnyCell, Cell, TsplibCell
+from benchmarks.suite import AnyCell, Cell, PublicCell, TsplibCell
 from mtsp_env.instance import Instance, Tours
 from mtsp_env.reading import read_file
 from mtsp_env.tours import check_tours, lower_bound, makespan
@@ -128,9 +128,10 @@ def kept_cells(tsplib: Path | None = None, folder: Path = FOLDER) -> list[tuple[
     """Every (cell, seed) with kept tours; TSPLIB cells only if ``tsplib`` names the folder of their files."""
     cells: list[tuple[AnyCell, int]] = []
     for file in sorted(folder.glob("*.json")):
-        if size := re.fullmatch(r"uniform-(\d+)x(\d+)-seed(\d+)\.json", file.name):
-            n, m, seed = map(int, size.groups())
-            cells.append((Cell(n, m, len(_read_file(file))), seed))
+        if parts := re.fullmatch(r"(uniform|public)-(\d+)x(\d+)-seed(\d+)\.json", file.name):
+            n, m, seed = map(int, parts.groups()[1:])
+            kind = Cell if parts[1] == "uniform" else PublicCell
+            cells.append((kind(n, m, len(_read_file(file))), seed))
     if tsplib is not None:
         cells += [(replace(c, folder=tsplib), 0) for c in suite.TABLES["3"] if (folder / c.file(0)).exists()]
     return cells
@@ -151,9 +152,10 @@ def main(
     search: float | None = None,
     table: str | None = None,
     instances: int | None = None,
-    seed: int = suite.SEED,
+    seed: int | None = None,
     workers: int = 1,
     tsplib: Path | None = None,
+    cells: tuple[str, ...] = (),
 ) -> None:
     """Maintain the best known tours: take better ones from results, search for better ones, check them, in this order.
 
@@ -161,24 +163,31 @@ def main(
         check: check the kept tours.
         merge: files of results to take better tours from.
         search: seconds of the reference solver for each instance.
-        table: 1, 2, 3, figure4 or smoke; by default every cell with kept tours.
+        table: 1, 2, 3, figure4, seed3333 or smoke; by default every cell with kept tours.
         instances: number of instances in each cell of the table; by default the table's.
-        seed: seed of the table's instances.
+        seed: seed of the table's instances; by default 7, and 3333 for the table seed3333.
         workers: number of threads of the search.
         tsplib: folder with the TSPLIB files of table 3.
+        cells: labels of the table's cells to search and check, such as 50x5; by default all of them.
 
     Raises:
         OSError: a file cannot be read or written.
-        ValueError: nothing to do, an unknown table, or damaged files.
+        ValueError: nothing to do, an unknown table or cell, cells without a table, or damaged files.
     """
     if search is None and not check and not merge:
         raise ValueError("choose at least one of --merge FILES, --search SECONDS and --check")
+    if cells and table is None:
+        raise ValueError(f"name the table of the cells {list(cells)} with --table")
     if merge:
         print("\n".join(merge_rows(read_judged(merge, tsplib), tsplib)))
     if search is None and not check:
         return
-    cells = kept_cells(tsplib) if table is None else [(cell, seed) for cell in suite.cells(table, tsplib, instances)]
-    for cell, cell_seed in cells if search is not None else ():
+    if table is None:
+        chosen = kept_cells(tsplib)
+    else:
+        table_seed = suite.seed_of(table, seed)
+        chosen = [(cell, table_seed) for cell in suite.choose(suite.cells(table, tsplib, instances), cells)]
+    for cell, cell_seed in chosen if search is not None else ():
         print(search_cell(cell, cell_seed, search, workers))
-    for cell, cell_seed in cells if check else ():
+    for cell, cell_seed in chosen if check else ():
         print(verify(cell, cell_seed))

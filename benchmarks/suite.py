@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,27 +14,20 @@ from mtsp_env.instance import Instance, Tours
 from mtsp_env.machine import check_memory
 from mtsp_env.tsplib import read_tsplib
 
-SEED = 7  # of the test sets
+SEED = 7  # of the test sets drawn here
+PUBLIC_SEED = 3333  # of the public test set
+PUBLIC_SIZE = 100  # instances of each n in the public test set
 MOST_INSTANCES = 10_000  # in a cell
 BYTES_PER_INSTANCE = 1000  # beside those of its coordinates
 
 
 @dataclass(frozen=True)
-class Cell:
-    """``count`` uniform instances of one size. They depend on (seed, n, m) alone."""
+class Size:
+    """``count`` instances with n nodes, the depot included, and m agents."""
 
     n_nodes: int
     n_agents: int
     count: int
-
-    def instances(self, seed: int, distribution: str = "uniform") -> list[Instance]:
-        """Draw the cell's instances; the first k are the same for every ``count``."""
-        check_memory("instances", self.count, BYTES_PER_INSTANCE + 16 * self.n_nodes)
-        rng = np.random.default_rng([seed, self.n_nodes, self.n_agents])
-        return [
-            sample(distribution, rng, 1, self.n_nodes, self.n_agents).instance(0, f"{self.label}-{i}")
-            for i in range(self.count)
-        ]
 
     @property
     def label(self) -> str:
@@ -50,9 +44,50 @@ class Cell:
         """The cell's name in ``published.json``."""
         return [self.n_nodes, self.n_agents]
 
+
+@dataclass(frozen=True)
+class Cell(Size):
+    """``count`` uniform instances of one size. They depend on (seed, n, m) alone."""
+
+    def instances(self, seed: int, distribution: str = "uniform") -> list[Instance]:
+        """Draw the cell's instances; the first k are the same for every ``count``."""
+        check_memory("instances", self.count, BYTES_PER_INSTANCE + 16 * self.n_nodes)
+        rng = np.random.default_rng([seed, self.n_nodes, self.n_agents])
+        return [
+            sample(distribution, rng, 1, self.n_nodes, self.n_agents).instance(0, f"{self.label}-{i}")
+            for i in range(self.count)
+        ]
+
     def file(self, seed: int) -> str:
         """Name of the file with its best known tours."""
         return f"uniform-{self.label}-seed{seed}.json"
+
+
+@dataclass(frozen=True)
+class PublicCell(Size):
+    """The first ``count`` instances of the public test set of Equity-Transformer, DPN and UDC, for one n and m.
+
+    They are the rows of ``np.random.seed(3333); np.random.uniform(size=(100, n, 2))``, whose node 0 is the depot, so
+    that every m has the same nodes.
+
+    Raises:
+        ValueError: a ``count`` above 100.
+    """
+
+    def __post_init__(self) -> None:
+        if self.count > PUBLIC_SIZE:
+            raise ValueError(f"instances must be at most {PUBLIC_SIZE} in the public test set, got {self.count}")
+
+    def instances(self, seed: int) -> list[Instance]:
+        """Draw the cell's instances. Raises ValueError for another seed than 3333, which gives other instances."""
+        if seed != PUBLIC_SEED:
+            raise ValueError(f"the seed of the public test set is {PUBLIC_SEED}, got {seed}")
+        nodes = np.random.RandomState(seed).uniform(size=(PUBLIC_SIZE, self.n_nodes, 2))
+        return [Instance(nodes[i], self.n_agents, f"{self.label}-{i}") for i in range(self.count)]
+
+    def file(self, seed: int) -> str:
+        """Name of the file with its best known tours."""
+        return f"public-{self.label}-seed{seed}.json"
 
 
 @dataclass(frozen=True)
@@ -108,7 +143,7 @@ class TsplibCell:
         return f"{self.label}.json"
 
 
-AnyCell = Cell | TsplibCell
+AnyCell = Cell | PublicCell | TsplibCell
 
 # The paper prints the costs of gtsp150 as "kroa150". In TSPLIB's kroA150, with its first node as the depot, the trip to
 # the farthest city and back is 5395 long; in gtsp150 it has the length that the paper prints, 1554.64.
@@ -127,8 +162,34 @@ TABLES: dict[str, tuple[AnyCell, ...]] = {
     "figure4": tuple(
         Cell(n, 5, 5) for n in (20, 50, 100, 140, 200, 350, 500, 700, 1000)
     ),  # the paper's figure ends at 140
+    "seed3333": tuple(
+        PublicCell(n, m, 100 if n < 500 else 10)
+        for n, teams in (
+            (50, (5, 7, 10)),
+            (100, (5, 7, 10)),
+            (200, (10, 15, 20)),
+            (500, (10,)),
+            (1000, (10,)),
+            (500, (30,)),
+            (1000, (50,)),
+        )
+        for m in teams
+    ),
     "smoke": (Cell(8, 2, 3),),
 }
+
+
+def seed_of(table: str, seed: int | None = None) -> int:
+    """The seed of a table's instances: ``seed``, or by default the table's own.
+
+    Raises:
+        ValueError: another seed than 3333 for the public test set.
+    """
+    if table != "seed3333":
+        return SEED if seed is None else seed
+    if seed not in (None, PUBLIC_SEED):
+        raise ValueError(f"the seed of table {table} is {PUBLIC_SEED}, got {seed}")
+    return PUBLIC_SEED
 
 
 def cells(table: str, tsplib: Path | None = None, count: int | None = None) -> tuple[AnyCell, ...]:
@@ -158,6 +219,15 @@ def cells(table: str, tsplib: Path | None = None, count: int | None = None) -> t
         if not chosen:
             raise ValueError(f"{tsplib}: none of {', '.join(f'{name}.tsp' for name, _ in _TSPLIB)}")
     return chosen
+
+
+def choose(chosen: Sequence[AnyCell], labels: Sequence[str]) -> list[AnyCell]:
+    """The cells with these labels; all if there are no labels. Raises ValueError for an unknown one."""
+    known = [cell.label for cell in chosen]
+    for label in labels:
+        if label not in known:
+            raise ValueError(f"unknown cell {label!r}; choose from {known}")
+    return [cell for cell in chosen if not labels or cell.label in labels]
 
 
 def find_cell(table: str, label: str) -> AnyCell:

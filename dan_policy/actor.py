@@ -51,7 +51,9 @@ def check_greatest(logits: Tensor) -> None:
         )
 
 
-def make_actor(network: Network, in_keys: Sequence[Key] | None = None) -> ProbabilisticActor:
+def make_actor(
+    network: Network, in_keys: Sequence[Key] | None = None, return_log_prob: bool = False
+) -> ProbabilisticActor:
     """A TorchRL actor that samples ``action`` from the softmax of the network's logits over ``action_mask``.
 
     Args:
@@ -61,6 +63,7 @@ def make_actor(network: Network, in_keys: Sequence[Key] | None = None) -> Probab
         in_keys: the keys of the observation that it takes, in order; ``action_mask`` and nested keys such as
             ``("game", "nodes")`` may be among them. None: the network's attribute ``in_keys``, or ``OBSERVATION`` if
             it has none.
+        return_log_prob: also write ``action_log_prob`` (...), which TorchRL's PPO losses read.
 
     Returns:
         A ``ProbabilisticActor`` that samples by default, and is greedy under
@@ -73,6 +76,7 @@ def make_actor(network: Network, in_keys: Sequence[Key] | None = None) -> Probab
         out_keys=["action"],
         distribution_class=FiniteCategorical,
         default_interaction_type=ExplorationType.RANDOM,
+        return_log_prob=return_log_prob,
     )
 
 

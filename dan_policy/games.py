@@ -46,7 +46,7 @@ def begin(
     if augment:
         nodes = views(torch.tensor(instance.nodes), rows).numpy()  # (rows, n, 2)
         problem = Problem(problem.n_agents, {**problem.arrays, "nodes": nodes})
-    state, left = rules.start(problem), [list(prefix[1:]) for prefix in prefixes]
+    state, left = rules.start(problem, game), [list(prefix[1:]) for prefix in prefixes]
     while any(left):
         agent = min((a for a in range(len(left)) if left[a]), key=lambda a: (state.ready[0, a], a))
         action, *left[agent] = left[agent]
@@ -77,7 +77,7 @@ def play(
             an illegal action.
     """
     logits_of = _logits_of(policy)
-    while not rules.all_visited(state).all():
+    while not rules.terminated(state).all():
         seen = rules.observe(state, game)
         mask = torch.as_tensor(seen.action_mask)
         logits = logits_of(state, seen)
@@ -130,7 +130,7 @@ def _tensor(state: rules.State, seen: rules.Observation, key: Key) -> Tensor:
 
 
 def _tensordict(state: rules.State, seen: rules.Observation) -> TensorDict:
-    observation = {name: torch.as_tensor(array) for name, array in seen._asdict().items()}
+    observation = {name: torch.as_tensor(array) for name, array in seen.arrays().items()}
     game = {name: torch.as_tensor(array) for name, array in state.arrays().items()}
     size = [observation["visited"].shape[0]]
     return TensorDict({**observation, "game": TensorDict(game, size)}, size)

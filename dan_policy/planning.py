@@ -24,7 +24,7 @@ from dan_policy.registry import find, load, network_name
 from dan_policy.symmetry import SYMMETRIES
 from mtsp_env import rules
 from mtsp_env.checks import check_count, check_seconds
-from mtsp_env.instance import WORLD_FIELDS, Instance, Tours
+from mtsp_env.instance import Instance, Tours, check_plain
 from mtsp_env.machine import check_memory
 from mtsp_env.tours import check_prefixes, check_tours, makespan
 
@@ -140,9 +140,10 @@ def solve(
         ImportError: ``improve`` without Numba.
         OSError: no such weights.
         TypeError: an option that does not exist.
-        ValueError: bad weights, an option outside its range, one that the policy does not have, or games that do not
-            fit into the memory.
+        ValueError: an instance with world fields, bad weights, an option outside its range, one that the policy does
+            not have, or games that do not fit into the memory.
     """
+    check_plain(instance)
     options = replace(options or SolveOptions(), **changes)
     check_memory("n_agents", instance.n_agents, BYTES_PER_AGENT)
     begun = [] if prefixes is None else check_prefixes(instance, prefixes)
@@ -168,13 +169,11 @@ def solve(
 
 
 def without_spare_agents(instance: Instance) -> Instance:
-    """The instance with at most one agent per city, if it is plain; others would never leave by the rule "final".
+    """A plain instance with at most one agent per city; others would never leave by the rule "final".
 
     All agents decide at the start, in their order, and each of them picks a city while there are any.
     """
-    if instance.n_agents < instance.n_nodes or any(name in instance.arrays() for name in WORLD_FIELDS):
-        return instance
-    return replace(instance, n_agents=instance.n_nodes - 1)
+    return replace(instance, n_agents=min(instance.n_agents, instance.n_nodes - 1))
 
 
 def _improvement(options: SolveOptions, prefixes: Tours) -> Callable[[Instance, Tours], Tours]:

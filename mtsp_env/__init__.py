@@ -7,17 +7,19 @@ Importing this package needs only NumPy, Gymnasium and PettingZoo; the batched T
 ``mtsp_env.batched``.
 """
 
-from mtsp_env.distributions import DISTRIBUTIONS, clustered, uniform
+from mtsp_env.distributions import DISTRIBUTIONS, SCENARIOS, clustered, uniform
 from mtsp_env.files import read_instance, read_tours, write_instance, write_tours
 from mtsp_env.instance import Instance, from_coordinates
-from mtsp_env.tours import check_tours, lower_bound, makespan, tour_lengths
+from mtsp_env.tours import check_log, check_tours, lower_bound, makespan, tour_lengths
 from mtsp_env.tsplib import read_tsplib
 from mtsp_env.version import __version__
 
 __all__ = [
     "DISTRIBUTIONS",
+    "SCENARIOS",
     "Instance",
     "__version__",
+    "check_log",
     "check_tours",
     "clustered",
     "from_coordinates",

@@ -105,6 +105,11 @@ def at_least(array: Array, low: float) -> Array:
     return np.maximum(array, low) if type(array) is np.ndarray else array.clamp(min=low)
 
 
+def at_most(array: Array, high: float) -> Array:
+    """The array with everything above ``high`` lowered to it."""
+    return np.minimum(array, high) if type(array) is np.ndarray else array.clamp(max=high)
+
+
 def norm(vector: Array) -> Array:
     """(...) Lengths of the vectors (..., 2)."""
     square = vector * vector

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -21,7 +22,7 @@ except ImportError as error:
 from mtsp_env import rules
 from mtsp_env.arrays import cast
 from mtsp_env.checks import check_count
-from mtsp_env.distributions import Generator, check_distribution, sample
+from mtsp_env.distributions import Generator, check_distribution, sample, scenario_shapes
 from mtsp_env.instance import FIELDS, ArrayField, Problem, Tours, check_arrays
 
 Arrays = dict[str, "torch.Tensor"]
@@ -33,12 +34,13 @@ class BatchedMTSP(EnvBase):
     At each step row b's deciding agent, ``agent[b]``, picks its next node. Keys:
 
     - observation of the deciding agent: ``cities`` (B, n, 2) float32, ``agents`` (B, m, 3) float32, ``visited`` (B, n)
-      bool, ``action_mask`` (B, n) bool, ``agent`` (B,) int64, its index;
+      bool, ``action_mask`` (B, n) bool, ``agent`` (B,) int64, its index; in worlds, or with ``view`` or ``hearing``,
+      also those of ``mtsp_env.rules.OBSERVED`` that apply;
     - ``action`` (B,) int64, the node to go to next; ``reward`` (B, 1) float32; ``done``, ``terminated``, ``truncated``
       (B, 1) bool;
-    - the state of the games, nested under ``"game"``: the problem (``("game", "nodes")``, (B, n, 2) float64) and
-      ``mtsp_env.rules.STATE_FIELDS``. The environment keeps nothing else, so that any TensorDict of a rollout can be
-      stepped from.
+    - the state of the games, nested under ``"game"``: the problem (``("game", "nodes")``, (B, n, 2) float64, and the
+      fields of its world) and ``mtsp_env.rules.STATE_FIELDS``. The environment keeps nothing else, so that any
+      TensorDict of a rollout can be stepped from.
 
     ``reset(TensorDict({"game": {"nodes": nodes}}, [B]), set_state=True)`` replays given instances; with all fields of
     the state under ``"game"``, the games go on from there. With ``set_state=False`` a TensorDict's state is ignored:
@@ -55,7 +57,8 @@ class BatchedMTSP(EnvBase):
     own ``set_seed``: ``ParallelEnv.set_seed(seed)`` gives worker i the i-th of a series of seeds that ``seed`` starts.
 
     Args:
-        n_nodes, n_agents, speed, depot, reward, max_decisions, distribution: as for ``mtsp_v0.raw_env``.
+        n_nodes, n_agents, speed, depot, reward, max_decisions, distribution, scenario, view, hearing: as for
+            ``mtsp_v0.raw_env``.
         batch_size: B or [B].
         device: where the games live, "cpu" or "cuda". None: on the CPU, in TensorDicts without a device, which TorchRL
             makes a little faster.
@@ -85,15 +88,20 @@ class BatchedMTSP(EnvBase):
         device: torch.device | str | None = None,
         seed: int | None = None,
         check_actions: bool = True,
+        scenario: str | Generator = "plain",
+        view: int | None = None,
+        hearing: float | None = None,
     ):
-        self.rules = rules.make_rules(n_nodes, n_agents, speed, depot, reward, max_decisions)
+        self.rules = rules.make_rules(n_nodes, n_agents, speed, depot, reward, max_decisions, view, hearing)
         check_distribution(distribution)
         sizes = [batch_size] if isinstance(batch_size, (int, np.integer)) else list(batch_size)
         if len(sizes) != 1:
             raise ValueError(f"batch_size must be B or [B], got {batch_size!r}")
         check_count("batch_size", sizes[0], minimum=1)
         super().__init__(device=device, batch_size=torch.Size(sizes))
-        self.n_nodes, self.n_agents, self.distribution = n_nodes, n_agents, distribution
+        self.n_nodes, self.n_agents, self.distribution, self.scenario = n_nodes, n_agents, distribution, scenario
+        self._world = scenario_shapes(scenario, sizes[0], n_nodes, n_agents)  # its world fields, of one instance
+        rules.check_world(self._world, self.rules)
         self.check_actions = check_actions
         self._rng = np.random.default_rng(seed)
         self._last: TensorDictBase | None = None  # for tours()
@@ -106,24 +114,27 @@ class BatchedMTSP(EnvBase):
     def _make_specs(self) -> None:
         batch, n, m = self.batch_size[0], self.n_nodes, self.n_agents
 
-        def spec(field: ArrayField) -> Bounded | Unbounded | Binary:
-            sizes = (batch, *field.sizes(n, m))
+        def spec(name: str, field: ArrayField) -> Bounded | Unbounded | Binary:
+            sizes = (batch, *self._world.get(name, field.sizes(n, m)))
             options = {"dtype": getattr(torch, field.dtype), "device": self.device}
             if field.dtype == "bool":
                 return Binary(sizes[-1], sizes, **options)
-            if field.low is not None and field.high is not None:
+            if field.low is not None and field.high is not None and math.isfinite(field.high):
                 return Bounded(field.low, field.high, sizes, **options)
             return Unbounded(sizes, **options)
 
-        fields = {"nodes": FIELDS["nodes"], **rules.STATE_FIELDS}
-        game = {name: spec(field) for name, field in fields.items()}
+        fields = {name: FIELDS[name] for name in ("nodes", *self._world)} | rules.state_fields(self._world)
+        game = {name: spec(name, field) for name, field in fields.items()}
+        extra = rules.observed_fields(self._world, self.rules)
         observation = {
             "cities": Bounded(-1.0, 1.0, (batch, n, 2), dtype=torch.float32, device=self.device),
             "agents": Unbounded((batch, m, 3), dtype=torch.float32, device=self.device),
             "visited": Binary(n, (batch, n), dtype=torch.bool, device=self.device),
             "action_mask": Binary(n, (batch, n), dtype=torch.bool, device=self.device),
             "agent": Categorical(m, (batch,), dtype=torch.int64, device=self.device),
+            **{name: spec(name, field) for name, field in extra.items()},
         }
+        self._state_keys = rules.state_fields(self._world).keys()
         flag = Categorical(2, (batch, 1), dtype=torch.bool, device=self.device)
         done = {key: flag.clone() for key in ("done", "terminated", "truncated")}
         same = {"shape": self.batch_size, "device": self.device}
@@ -166,19 +177,30 @@ class BatchedMTSP(EnvBase):
         asked = None if tensordict is None else tensordict.get("_reset", None)
         given = set_state and asked is None  # otherwise fresh instances; TorchRL keeps the rows that _reset leaves out
         arrays = self._library(self._given_arrays(tensordict) if given else self._fresh_arrays(asked))
-        if rules.STATE_FIELDS.keys() <= arrays.keys():
+        problem = Problem(self.n_agents, {name: arrays[name] for name in FIELDS if name in arrays})
+        self._check_fields(problem)
+        if self._state_keys <= arrays.keys():
             state = rules.state_from_arrays(arrays, self.n_agents)
         else:
-            state = rules.start(Problem(self.n_agents, {name: arrays[name] for name in FIELDS if name in arrays}))
+            state = rules.start(problem, self.rules)
         return self._tensordict(self._outputs(state))
+
+    def _check_fields(self, problem: Problem) -> None:
+        shapes = {name: tuple(problem.arrays[name].shape[1:]) for name in problem.world}
+        if shapes != self._world:
+            raise ValueError(
+                f"this environment plays instances with the world fields {self._world}, as its scenario draws them, "
+                f"got some with {shapes}"
+            )
 
     def _fresh_arrays(self, asked: torch.Tensor | None) -> Arrays:
         batch = self.batch_size[0]
         rows = torch.ones(batch, dtype=torch.bool) if asked is None else asked.reshape(batch).cpu()
-        drawn = sample(self.distribution, self._rng, int(rows.sum()), self.n_nodes, self.n_agents)
+        drawn = sample(self.distribution, self._rng, int(rows.sum()), self.n_nodes, self.n_agents, self.scenario)
         arrays = {}
         for name, array in drawn.arrays.items():
-            arrays[name] = torch.zeros((batch, *array.shape[1:]), dtype=torch.float64)
+            # Ones in the rows that TorchRL keeps as they were: valid values of every field
+            arrays[name] = torch.ones((batch, *array.shape[1:]), dtype=torch.float64)
             arrays[name][rows] = torch.as_tensor(array)
             arrays[name] = arrays[name].to(self.device)
         return arrays
@@ -193,7 +215,7 @@ class BatchedMTSP(EnvBase):
         if nodes.shape != shape:
             raise ValueError(f"nodes must have shape {shape}, got {tuple(nodes.shape)}")
         arrays = {key: value.to(self.device).contiguous() for key, value in game.items()}
-        arrays["nodes"] = arrays["nodes"].to(torch.float64)
+        arrays |= {name: arrays[name].to(torch.float64) for name in FIELDS if name in arrays}
         check_arrays({name: arrays[name].cpu().numpy() for name in FIELDS if name in arrays}, self.n_agents)
         return arrays
 
@@ -224,9 +246,9 @@ class BatchedMTSP(EnvBase):
 
     def _outputs(self, state: rules.State, before: rules.State | None = None) -> tuple[dict, dict]:
         """Arrays at the root and arrays of the game; with the state before, also the reward of the decision."""
-        terminated, truncated = rules.all_visited(state), rules.truncated(state, self.rules)
+        terminated, truncated = rules.terminated(state), rules.truncated(state, self.rules)
         over = terminated | truncated
-        root = rules.observe(state, self.rules)._asdict()
+        root = rules.observe(state, self.rules).arrays()
         root |= {"done": over[:, None], "terminated": terminated[:, None], "truncated": truncated[:, None]}
         if before is not None:
             reward = rules.reward(before, state, self.rules, over)
@@ -297,10 +319,14 @@ class BatchedMTSP(EnvBase):
         return torch.as_tensor(rules.final_cost(self._state_of(tensordict), self.rules))
 
     def tours(self, tensordict: TensorDictBase | None = None) -> list[Tours]:
-        """Each row's tours, closed at the depot, in ``tensordict``; by default as of the last reset or step."""
+        """Each row's tours in ``tensordict``, by default as of the last reset or step.
+
+        They are closed at the depot, but those of broken agents.
+        """
         state = self._state_of(tensordict)
-        arrays = (torch.as_tensor(array).cpu().numpy() for array in (state.visits, state.destination))
-        return [rules.tours(visits, destination) for visits, destination in zip(*arrays, strict=True)]
+        arrays = [torch.as_tensor(array).cpu().numpy() for array in (state.visits, state.destination)]
+        alive = [None] * len(arrays[0]) if state.alive is None else torch.as_tensor(state.alive).cpu().numpy()
+        return [rules.tours(visits, at, True, living) for visits, at, living in zip(*arrays, alive, strict=True)]
 
     def _state_of(self, tensordict: TensorDictBase | None) -> rules.State:
         tensordict = self._last if tensordict is None else tensordict

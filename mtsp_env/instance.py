@@ -40,7 +40,8 @@ class ArrayField:
         low_allowed: whether ``low`` itself is allowed.
         high: greatest value; infinity is allowed only if this is ``math.inf``.
         zero_at_depot: whether entry 0 must be 0.
-        check: a further check of the array (..., *shape); returns what is wrong, or None.
+        check: a further check of the array ``(..., *shape)``; returns what is wrong, or None.
+        needs: the world field without which a game does not have this array; None: every game has it.
     """
 
     dtype: str
@@ -51,6 +52,7 @@ class ArrayField:
     high: float | None = None
     zero_at_depot: bool = False
     check: Callable[[np.ndarray], str | None] | None = None
+    needs: str | None = None
 
     def sizes(self, n_nodes: int, n_agents: int) -> tuple[int | None, ...]:
         """The shape in numbers; None stands for any length of at least 1."""
@@ -129,6 +131,16 @@ class Instance:
         """n, the depot included."""
         return len(self.nodes)
 
+    @property
+    def world(self) -> tuple[str, ...]:
+        """The names of its world fields; none if it is plain."""
+        return tuple(name for name in WORLD_FIELDS if getattr(self, name) is not None)
+
+    @property
+    def waiting_counts(self) -> bool:
+        """Whether waiting at the depot adds to an agent's own time: in worlds with ``appears`` or ``breaks``."""
+        return self.appears is not None or self.breaks is not None
+
     def _values(self) -> tuple:
         return tuple(getattr(self, each.name) for each in fields(self))
 
@@ -164,8 +176,8 @@ class Problem:
 
     Attributes:
         n_agents: m.
-        arrays: NumPy arrays or torch tensors (B, *shape) by their names in ``FIELDS``; ``nodes`` (B, n, 2) always, a
-            world's fields only if the instances have it.
+        arrays: NumPy arrays or torch tensors ``(B, *shape)`` by their names in ``FIELDS``; ``nodes`` (B, n, 2)
+            always, a world's fields only if the instances have it.
     """
 
     n_agents: int
@@ -180,6 +192,21 @@ class Problem:
     def n_nodes(self) -> int:
         """n, the depot included."""
         return self.nodes.shape[1]
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the problem has no world fields."""
+        return len(self.arrays) == 1
+
+    @property
+    def world(self) -> tuple[str, ...]:
+        """The names of its world fields."""
+        return tuple(name for name in WORLD_FIELDS if name in self.arrays)
+
+    @property
+    def waiting_counts(self) -> bool:
+        """Whether waiting at the depot adds to an agent's own time: in worlds with ``appears`` or ``breaks``."""
+        return "appears" in self.arrays or "breaks" in self.arrays
 
     def instance(self, row: int, name: str = "") -> Instance:
         """Row ``row`` of a problem of NumPy arrays as an instance."""
@@ -207,7 +234,7 @@ def _shapes(instance: Instance) -> dict[str, Any]:
 
 
 def check_arrays(arrays: Mapping[str, np.ndarray], n_agents: int) -> None:
-    """Raise ValueError unless ``arrays`` (..., *shape), by name, describe problems for ``n_agents`` agents."""
+    """Raise ValueError unless ``arrays`` ``(..., *shape)``, by name, describe problems for ``n_agents`` agents."""
     for name in arrays:
         if name not in FIELDS:
             raise ValueError(f"unknown field {name!r}; choose from {list(FIELDS)}")
@@ -259,11 +286,11 @@ def _describe_range(spec: ArrayField) -> str:
 
 
 def check_plain(problem: Instance | Problem) -> None:
-    """Raise ValueError if the problem has world fields, which this version cannot play or judge."""
+    """Raise ValueError if the problem has world fields."""
     arrays = problem.arrays() if isinstance(problem, Instance) else problem.arrays
     world = [name for name in WORLD_FIELDS if name in arrays]
     if world:
-        raise ValueError(f"only plain problems can be played and judged, this one has the world fields {world}")
+        raise ValueError(f"only plain problems can be solved and bounded, this one has the world fields {world}")
 
 
 def from_coordinates(xy: np.ndarray | Sequence, n_agents: int, name: str = "") -> Instance:

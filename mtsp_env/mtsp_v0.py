@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -12,9 +13,10 @@ from pettingzoo import AECEnv
 from pettingzoo.utils import wrappers
 
 from mtsp_env import rules
-from mtsp_env.distributions import Generator, check_distribution, distribution_name, sample
-from mtsp_env.instance import Instance, Tours, batch
-from mtsp_env.tours import makespan
+from mtsp_env.distributions import Generator, check_distribution, distribution_name, sample, scenario_shapes
+from mtsp_env.instance import Instance, Problem, Tours, batch
+from mtsp_env.log import write_log
+from mtsp_env.tours import Log, makespan
 
 if TYPE_CHECKING:
     from mtsp_env.render import Viewer
@@ -39,15 +41,20 @@ class raw_env(AECEnv):
     ``agent_selection`` is the agent that has just arrived. It observes a dict of
 
     - ``observation``: ``cities`` (n, 2) float32, node coordinates minus its own; ``agents`` (m, 3) float32, every
-      agent's destination minus its own position, and the distance that it still has to go; ``visited`` (n,) bool, the
-      global mask; ``agent``, its index, a scalar int64.
+      agent's destination minus its own position, and the time that it still needs, in the plain problem a distance;
+      ``visited`` (n,) bool, the global mask; ``agent``, its index, a scalar int64. In worlds also some of
+      ``agent_speeds``, ``agent_alive``, ``service``, ``agent_known`` and ``city_known``.
     - ``action_mask``: (n,) int8, its legal next nodes. ``env.action_space(agent).sample(mask)`` picks one of them.
 
     Its action is the node to go to next. When every city is visited all agents terminate at once, with the reward
     -makespan. The last infos hold ``makespan`` (in the unit square; if truncated, with the penalty); with
     ``reference``, also ``reference_makespan``, of near-optimal tours for the same instance, and ``regret``,
     ``makespan / reference_makespan - 1``: 0.1 means 10 % longer. ``env.unwrapped.tours`` are the tours, during a game
-    and after it.
+    and after it, and ``env.unwrapped.log`` is the log of all legs with their times.
+
+    With ``scenario``, the game is played in a world in which cities appear, agents break down, roads delay or agents
+    differ; docs/problem.md says what each world field means. Use the depot rule "wait" there: an agent with nothing to
+    do is asked again only when something happens.
 
     A running game can be copied (``copy.deepcopy``) and pickled; the copy goes on exactly as the original would.
 
@@ -66,21 +73,26 @@ class raw_env(AECEnv):
         n_nodes: n, the depot included, at least 2.
         n_agents: m, at least 1.
         speed: distance per tick of the clock, at least 1e-9.
-        depot: "open" (the paper) or "final", see ``mtsp_env.rules.Rules``.
+        depot: "open" (the paper), "wait" or "final", see ``mtsp_env.rules.Rules``.
         reward: "sparse" or "shaped", see ``mtsp_env.rules.Rules``.
         max_decisions: truncation, by default after 20 (n + m) decisions.
-        distribution: a key of ``mtsp_env.DISTRIBUTIONS``, or a function ``(rng, batch, n_nodes, n_agents) -> dict of
-            arrays``, see ``mtsp_env.distributions``.
+        distribution: where the nodes lie: a key of ``mtsp_env.DISTRIBUTIONS``, or a function ``(rng, batch, n_nodes,
+            n_agents) -> dict of arrays``, see ``mtsp_env.distributions``.
         render_mode: None, "rgb_array" or "human" (both need the extra ``render``).
         reference: measure regret. ``mtsp_env.reference.improve`` solves the instance as its first episode ends, with
             its default iterations and seed, so the same instance always has the same ``reference_makespan``: about
             0.1 s at n = 50, 3 s at n = 1000 (extra ``reference``).
         info_tours: put ``tours`` into the last infos as well. Lists of unequal lengths break the batches of some
             libraries.
+        scenario: the world: a key of ``mtsp_env.SCENARIOS``, or a function of the same form. It decides which world
+            fields all instances of this environment have; a function is called once at creation to find out.
+        view: an agent knows the nearest ``view`` open cities only; None: all.
+        hearing: an agent hears only of agents whose destination is at most this far away; None: of all.
 
     Raises:
         ImportError: ``reference`` without Numba.
-        ValueError: an argument outside its range, an instance of another size, or an illegal action; nothing changes.
+        ValueError: an argument outside its range, an instance of another size or with other world fields, or an illegal
+            action; nothing changes.
     """
 
     metadata: ClassVar[dict[str, Any]] = {
@@ -102,10 +114,15 @@ class raw_env(AECEnv):
         render_mode: str | None = None,
         reference: bool = False,
         info_tours: bool = False,
+        scenario: str | Generator = "plain",
+        view: int | None = None,
+        hearing: float | None = None,
     ):
         super().__init__()
-        self.rules = rules.make_rules(n_nodes, n_agents, speed, depot, reward, max_decisions)
+        self.rules = rules.make_rules(n_nodes, n_agents, speed, depot, reward, max_decisions, view, hearing)
         check_distribution(distribution)
+        self.world = tuple(scenario_shapes(scenario, 1, n_nodes, n_agents))  # its instances' world fields
+        rules.check_world(self.world, self.rules)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"unknown render_mode {render_mode!r}; choose from {self.metadata['render_modes']}")
         for name, value in (("reference", reference), ("info_tours", info_tours)):
@@ -113,15 +130,22 @@ class raw_env(AECEnv):
                 raise ValueError(f"{name} must be True or False, got {value!r}")
         if reference:
             import mtsp_env.reference  # noqa: F401  says at once if Numba is missing
+
+            if self.world:
+                raise ValueError(f"reference solves plain instances only, scenario {scenario!r} has {self.world}")
         self.n_nodes, self.n_agents = n_nodes, n_agents
-        self.distribution, self.render_mode = distribution, render_mode
+        self.distribution, self.scenario, self.render_mode = distribution, scenario, render_mode
         self.reference, self.info_tours = reference, info_tours
 
         self.possible_agents = [f"agent_{i}" for i in range(n_agents)]
         self._index = {name: np.array([i]) for i, name in enumerate(self.possible_agents)}  # (B,) with B = 1
-        self.observation_spaces = {a: _observation_space(n_nodes, n_agents) for a in self.possible_agents}
+        self._extra = rules.observed_fields(self.world, self.rules)
+        self._all_knowing = replace(self.rules, view=None, hearing=None)  # for state()
+        self.observation_spaces = {a: self._make_observation_space() for a in self.possible_agents}
         self.action_spaces = {a: spaces.Discrete(n_nodes) for a in self.possible_agents}
-        self.state_space = spaces.Box(0.0, np.float32(3e38), (3 * n_nodes + 4 * n_agents,), np.float32)
+        shared = rules.observed_fields(self.world, self._all_knowing)
+        size = 3 * n_nodes + 4 * n_agents + sum(n_nodes if f.shape == ("n",) else n_agents for f in shared.values())
+        self.state_space = spaces.Box(0.0, np.float32(3e38), (size,), np.float32)
         self._rng = np.random.default_rng()
         self._legal: np.ndarray | None = None  # (n,) the deciding agent's mask, once it is known
         self._viewer: Viewer | None = None
@@ -137,8 +161,24 @@ class raw_env(AECEnv):
         return {**self.__dict__, "_viewer": None}
 
     def observation_space(self, agent: str) -> spaces.Space:
-        """Dict(observation=Dict(cities, agents, visited, agent), action_mask)."""
+        """Dict(observation=Dict(cities, agents, visited, agent, and the keys of the world), action_mask)."""
         return self.observation_spaces[agent]
+
+    def _make_observation_space(self) -> spaces.Dict:
+        n, m = self.n_nodes, self.n_agents
+        longest = np.inf if self.world else np.sqrt(2.0)  # remaining time
+        low = np.tile(np.array([-1, -1, 0], np.float32), (m, 1))
+        high = np.tile(np.array([1, 1, longest], np.float32), (m, 1))
+        observation: dict[str, spaces.Space] = {
+            "cities": spaces.Box(-1.0, 1.0, (n, 2), np.float32),
+            "agents": spaces.Box(low, high, dtype=np.float32),
+            "visited": spaces.Box(0, 1, (n,), np.bool_),
+            "agent": spaces.Discrete(m),
+        }
+        for name, field in self._extra.items():
+            dtype = np.dtype(field.dtype).type
+            observation[name] = spaces.Box(0, 1 if dtype is np.bool_ else np.inf, field.sizes(n, m), dtype)  # type: ignore[arg-type]
+        return spaces.Dict({"observation": spaces.Dict(observation), "action_mask": spaces.Box(0, 1, (n,), np.int8)})
 
     def action_space(self, agent: str) -> spaces.Space:
         """Discrete(n): the node to go to next."""
@@ -162,13 +202,17 @@ class raw_env(AECEnv):
                 f"the instance has n_nodes={instance.n_nodes}, n_agents={instance.n_agents}, this environment "
                 f"n_nodes={self.n_nodes}, n_agents={self.n_agents}"
             )
+        if instance is not None:
+            self._check_fields(batch([instance]))
         if seed is not None:
             self._rng = np.random.default_rng(seed)
         if instance is None:
-            drawn = sample(self.distribution, self._rng, 1, self.n_nodes, self.n_agents)
+            drawn = sample(self.distribution, self._rng, 1, self.n_nodes, self.n_agents, self.scenario)
+            self._check_fields(drawn)
             instance = drawn.instance(0, distribution_name(self.distribution))
-        self.game = rules.start(batch([instance]))
+        self.game = rules.start(batch([instance]), self.rules)
         self.instance = instance
+        self._decisions: list[int] = []  # the nodes picked so far, for the log
         self._legal = None
 
         self.agents = list(self.possible_agents)
@@ -186,15 +230,15 @@ class raw_env(AECEnv):
         seen = rules.observe(self.game, self.rules, self._index[agent])
         if agent == self.agent_selection:
             self._legal = seen.action_mask[0]  # step() checks against it
-        return {
-            "observation": {
-                "cities": seen.cities[0],
-                "agents": seen.agents[0],
-                "visited": seen.visited[0],
-                "agent": seen.agent[0],
-            },
-            "action_mask": seen.action_mask[0].astype(np.int8),
+        observation = {
+            "cities": seen.cities[0],
+            "agents": seen.agents[0],
+            "visited": seen.visited[0],
+            "agent": seen.agent[0],
         }
+        for name in self._extra:
+            observation[name] = getattr(seen, name)[0]
+        return {"observation": observation, "action_mask": seen.action_mask[0].astype(np.int8)}
 
     def step(self, action: int | None) -> None:
         """The selected agent sets off for node ``action``; the next to arrive is selected.
@@ -207,11 +251,12 @@ class raw_env(AECEnv):
             return
         action = self._check_action(action)
         before, self.game = self.game, rules.depart(self.game, self.rules, np.array([action]))
+        self._decisions.append(action)
 
         self._cumulative_rewards[self.agent_selection] = 0.0
         self.agent_selection = self.possible_agents[rules.agent_to_decide(self.game)[0]]
         self._legal = None
-        terminated = bool(rules.all_visited(self.game)[0])
+        terminated = bool(rules.terminated(self.game)[0])
         truncated = not terminated and int(self.game.decisions[0]) >= self.rules.max_decisions
         if terminated or truncated or self.rules.reward == "shaped":
             self.rewards = dict.fromkeys(self.agents, float(rules.reward(before, self.game, self.rules)[0]))
@@ -249,15 +294,34 @@ class raw_env(AECEnv):
         if self._legal is None:
             self._legal = rules.legal_actions(self.game, self.rules, self._index[name])[0]
         if not self._legal[node]:
-            why = "is not open to it now" if node == 0 else "is visited already"
+            why = "is not open to it now" if node == 0 or not self.game.visited[0, node] else "is visited already"
             raise ValueError(f"{name} may not go to node {node}: it {why}; see action_mask")
         return node
 
+    def _check_fields(self, problem: Problem) -> None:
+        if problem.world != self.world:
+            raise ValueError(
+                f"this environment plays instances with the world fields {list(self.world)}, as its scenario draws "
+                f"them, got one with {list(problem.world)}"
+            )
+
     @property
     def tours(self) -> Tours:
-        """Every agent's tour so far; once the episode is over, each ends at the depot."""
-        over = any(self.terminations.values()) or any(self.truncations.values()) or not self.agents
-        return rules.tours(self.game.visits[0], self.game.destination[0], close=over)
+        """Every agent's tour so far; once the episode is over, each ends at the depot, but those of broken agents."""
+        alive = None if self.game.alive is None else self.game.alive[0]
+        return rules.tours(self.game.visits[0], self.game.destination[0], self._is_over, alive)
+
+    @property
+    def log(self) -> Log:
+        """Every agent's legs so far, in units of time; see ``mtsp_env.tours.Leg`` and ``check_log``.
+
+        A leg under way is in it as if nothing came between. Once the episode is over, the return legs are in it, too.
+        """
+        return write_log(batch([self.instance]), self.rules, self._decisions, self._is_over)
+
+    @property
+    def _is_over(self) -> bool:
+        return any(self.terminations.values()) or any(self.truncations.values()) or not self.agents
 
     @property
     def now(self) -> int:
@@ -265,15 +329,22 @@ class raw_env(AECEnv):
         return int(rules.now(self.game)[0])
 
     def state(self) -> np.ndarray:
-        """All there is, float32 (3 n + 4 m,): nodes (x, y, visited), agents (destination x, y; g; tour length)."""
+        """What is known to all agents together, and their own times: float32 (3 n + 4 m,), more in worlds.
+
+        Nodes (x, y, visited), agents (destination x, y; g; own time after the current leg), then those of
+        ``agent_speeds``, ``agent_alive``, ``service`` and ``city_known`` that the world has.
+        """
         game, m = self.game, self.n_agents
-        seen = rules.observe(game, self.rules)
+        seen = rules.observe(game, self._all_knowing)
         nodes = self.instance.nodes
-        per_node = np.concatenate([nodes, game.visited[0][:, None]], axis=1)
+        if seen.city_known is not None:
+            nodes = np.where(seen.city_known[0][:, None], nodes, nodes[0])
+        per_node = np.concatenate([nodes, seen.visited[0][:, None]], axis=1)
         per_agent = np.concatenate(
-            [nodes[game.destination[0]], seen.agents[0][:, 2:], game.length[0].reshape(m, 1)], axis=1
+            [nodes[game.destination[0]], seen.agents[0][:, 2:], game.own_time[0].reshape(m, 1)], axis=1
         )
-        return np.concatenate([per_node.ravel(), per_agent.ravel()]).astype(np.float32)
+        extra = [array[0] for name, array in seen.arrays().items() if name in rules.OBSERVED]
+        return np.concatenate([per_node.ravel(), per_agent.ravel(), *extra]).astype(np.float32)
 
     def render(self) -> np.ndarray | None:
         """ "rgb_array": the picture, uint8 (height, width, 3). "human": shown in a window, None."""
@@ -297,22 +368,3 @@ def _reference_makespan(instance: Instance) -> float:
     from mtsp_env.reference import improve
 
     return makespan(instance, improve(instance))
-
-
-def _observation_space(n_nodes: int, n_agents: int) -> spaces.Dict:
-    farthest = np.float32(np.sqrt(2.0))
-    low = np.tile(np.array([-1, -1, 0], np.float32), (n_agents, 1))
-    high = np.tile(np.array([1, 1, farthest], np.float32), (n_agents, 1))
-    return spaces.Dict(
-        {
-            "observation": spaces.Dict(
-                {
-                    "cities": spaces.Box(-1.0, 1.0, (n_nodes, 2), np.float32),
-                    "agents": spaces.Box(low, high, dtype=np.float32),
-                    "visited": spaces.Box(0, 1, (n_nodes,), np.bool_),  # type: ignore[arg-type]  # not in its types
-                    "agent": spaces.Discrete(n_agents),
-                }
-            ),
-            "action_mask": spaces.Box(0, 1, (n_nodes,), np.int8),
-        }
-    )

@@ -4,139 +4,90 @@ Pure functions over arrays with a leading batch dimension B, written against the
 PettingZoo environment, B = 1; the batched environment on a CPU) and torch tensors (the batched environment on a GPU, or
 compiled) run the same lines; ``arrays.py`` holds the primitives that differ. The clock is event-driven: instead of
 looping over ticks, the next to decide is the agent with the smallest (ready tick, index).
+
+One decision: ``agent_to_decide`` -> ``observe`` -> the agent picks one of its ``legal_actions`` -> ``depart``. What
+differs in problems with world fields is in ``world.py``.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Annotated, Literal, NamedTuple, get_type_hints
-
 import numpy as np
 
+from mtsp_env import world
 from mtsp_env.arrays import append, at_least, cast, indices, library, locate, minus, norm, pick, pick_many, put
-from mtsp_env.checks import check_count
-from mtsp_env.instance import FIELDS, Array, ArrayField, Problem, Tours, check_plain
+from mtsp_env.instance import Array, Problem, Tours
+from mtsp_env.state import (
+    DEPOTS,
+    NEVER,
+    OBSERVED,
+    REWARDS,
+    STATE_FIELDS,
+    TICK_TOLERANCE,
+    Depot,
+    Observation,
+    Reward,
+    Rules,
+    State,
+    check_world,
+    make_rules,
+    observed_fields,
+    state_fields,
+    state_from_arrays,
+    travel_ticks,
+)
 
-Depot = Literal["open", "final"]
-Reward = Literal["sparse", "shaped"]
-
-DEPOTS: tuple[str, ...] = ("open", "final")
-REWARDS: tuple[str, ...] = ("sparse", "shaped")
-TICK_TOLERANCE = 1e-9  # a leg within this of a whole number of ticks counts as that number
-NEVER = 2**62  # ready tick of an agent whose tour is closed for good (depot "final")
-
-
-@dataclass(frozen=True)
-class Rules:
-    """The settings of a game.
-
-    Attributes:
-        speed: distance per tick (the paper's Delta g: 0.1 in training, 0.01 in tests), at least 1e-9.
-        depot: "open" (the paper): the depot is always legal, picking it there waits one tick. "final": picking the
-            depot ends that agent's tour, so that an episode takes at most n - 1 + m decisions.
-        reward: "sparse": -makespan at the end. "shaped": each decision pays the change of -(longest closed tour so
-            far); the sum is the same.
-        max_decisions: an episode is truncated after so many; a sensible policy never meets 20 (n + m).
-
-    Raises:
-        ValueError: a value outside its range.
-    """
-
-    speed: float
-    depot: Depot
-    reward: Reward
-    max_decisions: int
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.speed) and self.speed >= 1e-9):
-            raise ValueError(f"speed must be a finite distance per tick of at least 1e-9, got {self.speed!r}")
-        if self.depot not in DEPOTS:
-            raise ValueError(f"unknown depot rule {self.depot!r}; choose from {list(DEPOTS)}")
-        if self.reward not in REWARDS:
-            raise ValueError(f"unknown reward {self.reward!r}; choose from {list(REWARDS)}")
-        check_count("max_decisions", self.max_decisions, minimum=1)
-
-
-def make_rules(
-    n_nodes: int, n_agents: int, speed: float, depot: Depot, reward: Reward, max_decisions: int | None
-) -> Rules:
-    """Validated ``Rules`` for games of this size; ``max_decisions=None`` means 20 (n + m)."""
-    check_count("n_nodes", n_nodes, minimum=2)
-    check_count("n_agents", n_agents, minimum=1)
-    return Rules(speed, depot, reward, 20 * (n_nodes + n_agents) if max_decisions is None else max_decisions)
-
-
-class State(NamedTuple):
-    """A batch of B games; ``STATE_FIELDS`` has the dtypes and shapes of its arrays.
-
-    Most of it could be derived from the problem and the decisions made, but keeping it costs less than deriving it.
-    """
-
-    problem: Problem
-    seen_nodes: Annotated[Array, ArrayField("float32", ("n", 2), "the nodes, as observations are computed from them")]
-    visited: Annotated[
-        Array,
-        ArrayField("bool", ("n",), "the global mask M: a city counts once an agent sets off for it, the depot never"),
-    ]
-    cities_left: Annotated[Array, ArrayField("int64", (), "number of unvisited cities")]
-    visits: Annotated[
-        Array, ArrayField("int32", ("n",), "who visited a city, and in which order; -1: unvisited; see _visit_code")
-    ]
-    destination: Annotated[Array, ArrayField("int64", ("m",), "node at which an agent is or to which it travels")]
-    leg: Annotated[Array, ArrayField("float64", ("m",), "length of its current leg")]
-    departed: Annotated[Array, ArrayField("int64", ("m",), "tick at which it set off on that leg")]
-    ready: Annotated[Array, ArrayField("int64", ("m",), "tick at which it decides next; NEVER: its tour is closed")]
-    length: Annotated[Array, ArrayField("float64", ("m",), "length of its tour so far, the current leg included")]
-    closed: Annotated[Array, ArrayField("int64", (), 'number of agents whose tour is closed (depot "final")')]
-    decisions: Annotated[Array, ArrayField("int64", (), "decisions made so far")]
-
-    def arrays(self) -> dict[str, Array]:
-        """Every array of the problem and of the state, by name."""
-        return {**self.problem.arrays, **dict(zip(STATE_FIELDS, self[1:], strict=True))}
+__all__ = [
+    "DEPOTS",
+    "NEVER",
+    "OBSERVED",
+    "REWARDS",
+    "STATE_FIELDS",
+    "TICK_TOLERANCE",
+    "Depot",
+    "Observation",
+    "Reward",
+    "Rules",
+    "State",
+    "agent_to_decide",
+    "are_legal",
+    "check_world",
+    "depart",
+    "final_cost",
+    "legal_actions",
+    "make_rules",
+    "makespan",
+    "now",
+    "observe",
+    "observed_fields",
+    "remaining_times",
+    "reward",
+    "start",
+    "state_fields",
+    "state_from_arrays",
+    "terminated",
+    "tours",
+    "travel_ticks",
+    "truncated",
+]
 
 
-STATE_FIELDS: dict[str, ArrayField] = {
-    name: hint.__metadata__[0]
-    for name, hint in get_type_hints(State, include_extras=True).items()
-    if hasattr(hint, "__metadata__")
-}
-
-
-def state_from_arrays(arrays: Mapping[str, Array], n_agents: int) -> State:
-    """The state whose ``arrays()`` are given; further keys are ignored."""
-    problem = Problem(n_agents, {name: arrays[name] for name in FIELDS if name in arrays})
-    return State(problem, *(arrays[name] for name in STATE_FIELDS))
-
-
-class Observation(NamedTuple):
-    """What one agent per row sees (paper, Sec. 4, Observation). Lengths are float32, masks bool."""
-
-    cities: Array  # (B, n, 2)   node coordinates minus its own
-    agents: Array  # (B, m, 3)   every agent's destination minus its own position, and its remaining travel distance g
-    visited: Array  # (B, n)     the global mask M; the depot never counts as visited
-    action_mask: Array  # (B, n) its legal next nodes
-    agent: Array  # (B,)         its index, int64
-
-
-def start(problem: Problem) -> State:
+def start(problem: Problem, rules: Rules) -> State:
     """All agents at the depot at tick 0, no city visited.
 
     Raises:
-        ValueError: the problem has world fields, or n m is 2^30 or more (``visits`` would overflow).
+        ValueError: a world that cannot be played by ``rules``, or n m is 2^30 or more (``visits`` would overflow).
     """
-    check_plain(problem)
+    check_world(problem.arrays, rules)
     nodes, n_agents = problem.nodes, problem.n_agents
     xp, on = library(nodes)
     batch, n_nodes = nodes.shape[0], nodes.shape[1]
-    if n_nodes * n_agents >= 2**30:
+    if (n_nodes + ("breaks" in problem.arrays) * n_agents) * n_agents >= 2**30:
         raise ValueError(f"n_nodes * n_agents must be below 2^30, got {n_nodes} * {n_agents}")
 
     def zeros(*shape: int, dtype: object = xp.int64) -> Array:
         return xp.zeros(shape, dtype=dtype, device=on)
 
-    return State(
+    state = State(
         problem=problem,
         seen_nodes=xp.astype(nodes, xp.float32),
         visited=zeros(batch, n_nodes, dtype=xp.bool),
@@ -146,9 +97,18 @@ def start(problem: Problem) -> State:
         leg=zeros(batch, n_agents, dtype=xp.float64),
         departed=zeros(batch, n_agents),
         ready=zeros(batch, n_agents),
-        length=zeros(batch, n_agents, dtype=xp.float64),
+        own_time=zeros(batch, n_agents, dtype=xp.float64),
         closed=zeros(batch),
         decisions=zeros(batch),
+    )
+    if problem.is_plain:
+        return state
+    needed = state_fields(problem.arrays)
+    return state._replace(
+        legs=zeros(batch, n_agents) if "legs" in needed else None,
+        arrival=zeros(batch, n_agents) if "arrival" in needed else None,
+        alive=zeros(batch, n_agents, dtype=xp.bool) | True if "alive" in needed else None,
+        **world.event_ticks(problem, rules),
     )
 
 
@@ -162,27 +122,38 @@ def now(state: State) -> Array:
     return pick(state.ready, locate(agent_to_decide(state), state.ready.shape[1]))
 
 
-def all_visited(state: State) -> Array:
-    """(B,) bool: the game is over, all agents terminate at once."""
-    return state.cities_left == 0
+def terminated(state: State) -> Array:
+    """(B,) bool: the game is over, all agents terminate at once.
 
-
-def legal_actions(state: State, rules: Rules, agent: Array, here: Array | None = None) -> Array:
-    """(B, n) bool: the nodes that ``agent`` (B,) may pick: unvisited cities, and the depot by ``rules.depot``.
-
-    "open": always, unless all agents stand at the depot and cities remain, so that something moves.
-    "final": not before the agent's first city, nor by the last agent still out while cities remain.
-    When every city is visited only the depot is legal, so a mask is never empty. ``here`` (B,) is the node of
-    ``agent``, if that is known already.
+    Every city is visited, and in worlds with ``breaks`` also reached: until then a breakdown can reopen one.
     """
+    over = state.cities_left == 0
+    return over if state.alive is None else over & (world.last_arrival(state) <= now(state))
+
+
+def legal_actions(state: State, rules: Rules, agent: Array) -> Array:
+    """(B, n) bool: the nodes that ``agent`` (B,) may pick: unvisited cities that it knows, and the depot by its rule.
+
+    "open" and "wait": always, unless all agents that are not broken stand at the depot while known cities are
+    unvisited, so that something moves. "final": not before the agent's first city, nor by the last agent still out
+    while cities remain. If no city can be picked the depot is legal, so a mask is never empty.
+    """
+    tick, here = now(state), pick(state.destination, locate(agent, state.ready.shape[1]))
+    return _legal(state, rules, tick, here, world.known_cities(state, rules, tick, here))
+
+
+def _legal(state: State, rules: Rules, tick: Array, here: Array, known: Array | None) -> Array:
     mask = ~state.visited  # (B, n)
-    if rules.depot == "open":
-        underway = (state.leg > 0) & (state.ready > now(state)[:, None])
-        depot = ((state.destination != 0) | underway).any(1)
-    else:
-        here = pick(state.destination, locate(agent, state.ready.shape[1])) if here is None else here
+    nothing_open = state.cities_left == 0
+    if known is not None:
+        mask = mask & known
+        nothing_open = ~library(mask)[0].any(mask[:, 1:], axis=1)
+    if rules.depot == "final":
         depot = (here != 0) & (state.closed < state.ready.shape[1] - 1)
-    mask[:, 0] = depot | all_visited(state)
+    else:
+        away = (state.destination != 0) | ((state.leg > 0) & (state.ready > tick[:, None]))
+        depot = (away if state.alive is None else away & state.alive).any(1)
+    mask[:, 0] = depot | nothing_open
     return mask
 
 
@@ -198,8 +169,8 @@ def are_legal(action: Array, action_mask: Array) -> Array:
 def observe(state: State, rules: Rules, agent: Array | None = None) -> Observation:
     """What ``agent`` (B,) sees, by default the one to decide.
 
-    Algorithm 1 lowers g inside the loop over agents, so agent i sees the agents before it (j < i) one tick further on.
     An agent underway sees the world from its destination, where it will decide next; a decider's own row is (0, 0, 0).
+    Cities that it does not know look visited and lie on the depot.
     """
     decider = agent_to_decide(state)
     agent = decider if agent is None else agent
@@ -208,17 +179,32 @@ def observe(state: State, rules: Rules, agent: Array | None = None) -> Observati
     here = pick(state.destination, locate(agent, n_agents))
     cities = minus(state.seen_nodes, pick(state.seen_nodes, locate(here, n_nodes)))  # (B, n, 2)
     heading = pick_many(cities, state.destination)  # (B, m, 2)
-
-    before = indices(state.ready, axis=1) < agent[:, None]  # (B, m): j < i
-    elapsed = cast(tick[:, None] + before - state.departed, "float64") + TICK_TOLERANCE
-    remaining = at_least(state.leg - rules.speed * elapsed, 0.0)  # (B, m)
-
-    return Observation(
+    remaining = remaining_times(state, rules, agent, decider, tick)  # (B, m)
+    known = world.known_cities(state, rules, tick, here)
+    seen = Observation(
         cities=cities,
         agents=append(heading, remaining),
         visited=state.visited,
-        action_mask=legal_actions(state, rules, agent, here),
+        action_mask=_legal(state, rules, tick, here, known),
         agent=agent,
+    )
+    if state.problem.is_plain and known is None and rules.hearing is None:
+        return seen
+    return world.add_to_view(seen, state, rules, agent, here, known)
+
+
+def remaining_times(state: State, rules: Rules, agent: Array, decider: Array, tick: Array) -> Array:
+    """(B, m) Announced remaining times g of all agents, as ``agent`` (B,) sees them while ``decider`` decides.
+
+    Algorithm 1 lowers g inside the loop over agents, so agent i sees the agents before it (j < i) one tick further on.
+    """
+    before = indices(state.ready, axis=1) < agent[:, None]  # (B, m): j < i
+    elapsed = cast(tick[:, None] + before - state.departed, "float64") + TICK_TOLERANCE
+    remaining = at_least(state.leg - rules.speed * elapsed, 0.0)
+    if state.legs is None:
+        return remaining
+    return library(remaining)[0].where(  # with traffic, it may arrive earlier than announced
+        indices(state.ready, axis=1) == decider[:, None], 0.0, remaining
     )
 
 
@@ -228,58 +214,69 @@ def depart(state: State, rules: Rules, action: Array, agent: Array | None = None
     The caller has checked that the actions are legal. In a finished game only the depot is left to pick, which changes
     neither the makespan nor the tours.
     """
-    nodes, n_nodes, n_agents = state.problem.nodes, state.visited.shape[1], state.ready.shape[1]
+    problem, n_nodes, n_agents = state.problem, state.visited.shape[1], state.ready.shape[1]
     agent = agent_to_decide(state) if agent is None else agent
     own, goal = locate(agent, n_agents), locate(action, n_nodes)
     here, tick = pick(state.destination, own), pick(state.ready, own)
-    leg, is_city = norm(pick(nodes, goal) - pick(nodes, locate(here, n_nodes))), action != 0
-    arrival, closed = tick + travel_ticks(leg, rules.speed), state.closed
+    length = norm(pick(problem.nodes, goal) - pick(problem.nodes, locate(here, n_nodes)))
+    is_city, from_depot = action != 0, here == 0
+    if problem.is_plain:
+        leg, ready, own_time = length, tick + travel_ticks(length, rules.speed), pick(state.own_time, own) + length
+        world_fields = {}
+    else:
+        times = world.leg_times(state, own, goal, length)
+        leg, ready = times.announced, tick + world.ticks_of(times.total, rules)
+        own_time = world.leaves_at(state, rules, own, is_city & from_depot, tick) + times.total
+        world_fields = world.note_leg(state, rules, own, is_city | ~from_depot, tick, times)
+
+    closed = state.closed
     if rules.depot == "final":
-        arrival, closed = library(arrival)[0].where(is_city, arrival, NEVER), closed + ~is_city
-    return State(
-        problem=state.problem,
+        ready, closed = library(ready)[0].where(is_city, ready, NEVER), closed + ~is_city
+    elif rules.depot == "wait":
+        ready = library(ready)[0].where(is_city | ~from_depot, ready, NEVER)  # until something happens
+    after = State(
+        problem=problem,
         seen_nodes=state.seen_nodes,
         visited=put(state.visited, goal, is_city),
         cities_left=state.cities_left - cast(is_city, "int64"),
-        visits=put(state.visits, goal, _visit_code(n_nodes - state.cities_left, agent, here == 0, n_agents)),
+        visits=put(state.visits, goal, _visit_code(_order(state), agent, from_depot, n_agents)),
         destination=put(state.destination, own, action),
         leg=put(state.leg, own, leg),
         departed=put(state.departed, own, tick),
-        ready=put(state.ready, own, arrival),
-        length=put(state.length, own, pick(state.length, own) + leg),
+        ready=put(state.ready, own, ready),
+        own_time=put(state.own_time, own, own_time),
         closed=closed,
         decisions=state.decisions + 1,
+        **world_fields,
     )
-
-
-def travel_ticks(leg: Array, speed: float) -> Array:
-    """Ticks that a leg takes: max(1, ceil(leg / speed)), int64. A stay takes one tick."""
-    return cast(at_least(library(leg)[0].ceil(leg / speed - TICK_TOLERANCE), 1.0), "int64")
+    if problem.is_plain and rules.depot != "wait":
+        return after
+    return world.advance(after, rules, tick)
 
 
 def makespan(state: State) -> Array:
-    """(B,) float64: the longest tour so far, every agent's return leg counted."""
+    """(B,) float64: the makespan if all agents go home now; if plain, the longest tour so far, return legs counted."""
     nodes = state.problem.nodes
     way_home = norm(pick_many(nodes, state.destination) - nodes[:, :1])  # (B, m)
-    return library(state.length)[0].max(state.length + way_home, axis=1)
+    times = state.own_time + way_home if state.problem.is_plain else world.own_times(state, way_home)
+    return library(times)[0].max(times, axis=1)
 
 
 def truncated(state: State, rules: Rules) -> Array:
     """(B,) bool: the game was cut off at ``max_decisions`` with cities left."""
-    return (state.decisions >= rules.max_decisions) & (state.cities_left > 0)
+    return (state.decisions >= rules.max_decisions) & ~terminated(state)
 
 
 def final_cost(state: State, rules: Rules) -> Array:
     """(B,) float64: minus an episode's rewards: the makespan.
 
-    If the game was cut off, out-and-back trips to all unvisited cities come on top, so that stalling never pays.
+    If the game was cut off, out-and-back trips to all unvisited cities come on top, so that stalling never pays; see
+    ``world.cut_off_cost``.
     """
     cost, cut_off = makespan(state), truncated(state, rules)
     if type(cut_off) is np.ndarray and not cut_off.any():
         return cost
-    xp, nodes = library(cost)[0], state.problem.nodes
-    trips = xp.sum(xp.where(state.visited, 0.0, 2.0 * norm(nodes - nodes[:, :1])), axis=1)
-    return cost + xp.where(cut_off, trips, 0.0)
+    return library(cost)[0].where(cut_off, world.cut_off_cost(state, rules, cost, now(state)), cost)
 
 
 def reward(before: State, after: State, rules: Rules, over: Array | None = None) -> Array:
@@ -289,7 +286,7 @@ def reward(before: State, after: State, rules: Rules, over: Array | None = None)
     """
     if rules.reward == "shaped":
         return makespan(before) - final_cost(after, rules)
-    over = all_visited(after) | truncated(after, rules) if over is None else over
+    over = terminated(after) | truncated(after, rules) if over is None else over
     if type(over) is np.ndarray and not over.any():
         return np.zeros(len(over))  # most decisions: nothing to work out
     cost = final_cost(after, rules)
@@ -301,16 +298,23 @@ def reward(before: State, after: State, rules: Rules, over: Array | None = None)
 # Sorted, the numbers spell out the tours. The depot's entry means nothing.
 
 
+def _order(state: State) -> Array:
+    """(B,) The next visit's place in the order of all visits. A breakdown reopens one city at most: it still grows."""
+    order = state.visited.shape[1] - state.cities_left
+    return order if state.alive is None else order + library(order)[0].sum(cast(~state.alive, "int64"), axis=1)
+
+
 def _visit_code(order: Array, agent: Array, from_depot: Array, n_agents: int) -> Array:
     """(B,) int32."""
     return cast((order * n_agents + agent) * 2 + from_depot, "int32")
 
 
-def tours(visits: np.ndarray, destination: np.ndarray, close: bool = True) -> Tours:
+def tours(visits: np.ndarray, destination: np.ndarray, close: bool = True, alive: np.ndarray | None = None) -> Tours:
     """The tours of one game so far, from its rows of ``visits`` (n,) and ``destination`` (m,), as NumPy arrays.
 
     ``close`` appends the return leg to a tour whose agent is still out; an agent that never left has [0, 0], or [0]
-    if tours stay open. Waiting at the depot does not repeat it.
+    if tours stay open. Waiting at the depot does not repeat it. An agent that is not ``alive`` (m,) has broken down:
+    its tour ends with the last city that it reached, or with the depot if it had set off for it.
     """
     n_agents = len(destination)
     tours: Tours = [[0] for _ in range(n_agents)]
@@ -322,7 +326,8 @@ def tours(visits: np.ndarray, destination: np.ndarray, close: bool = True) -> To
         if code % 2 and tour[-1] != 0:
             tour.append(0)
         tour.append(city + 1)
-    for tour, node in zip(tours, destination.tolist(), strict=True):
-        if (tour[-1] != 0 and (close or node == 0)) or (close and len(tour) == 1):
+    closes = [close] * n_agents if alive is None else (alive & close).tolist()
+    for tour, node, returns in zip(tours, destination.tolist(), closes, strict=True):
+        if (tour[-1] != 0 and (returns or node == 0)) or (returns and len(tour) == 1):
             tour.append(0)
     return tours

@@ -1,15 +1,35 @@
-"""The only judge of tours: lengths, makespan, validity, and a lower bound. A solver's own cost is never trusted."""
+"""The only judge of tours and of logs: lengths, makespan, validity, and a lower bound.
+
+A solver's own cost is never trusted.
+"""
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Sequence
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mtsp_env.instance import Instance, Tours, check_plain
 from mtsp_env.spanning_tree import spanning_tree_length
+
+TOLERANCE = 1e-6  # of the times in a log
+
+
+class Leg(NamedTuple):
+    """One leg of an agent, in units of time on the clock."""
+
+    node: int  # to which it sets off
+    departed: float
+    arrived: float  # inf: it broke down on the way
+    ready: float  # when the visit ends; it decides again at the next tick
+
+
+Log = list[list[Leg]]
+"""The legs of each agent, in order. Staying at the depot is no leg."""
 
 
 def path_lengths(nodes: np.ndarray, paths: Sequence[Sequence[int]]) -> np.ndarray:
@@ -21,21 +41,44 @@ def tour_lengths(instance: Instance, tours: Sequence[Sequence[int]]) -> np.ndarr
     """Length of each tour, float64 (len(tours),), in units of the unit square.
 
     Multiply by ``instance.scale`` for the units of the file that the instance was read from.
-
-    Raises:
-        ValueError: the instance is not plain.
     """
-    check_plain(instance)
     return path_lengths(instance.nodes, tours)
 
 
-def makespan(instance: Instance, tours: Sequence[Sequence[int]]) -> float:
-    """Length of the longest tour, in units of the unit square: the paper's objective (Sec. 3), to be minimised.
+def tour_times(instance: Instance, tours: Sequence[Sequence[int]]) -> np.ndarray:
+    """How long each tour takes, one tour per agent, visits included: float64 (m,). If plain, the same as its length.
 
     Raises:
-        ValueError: the instance is not plain.
+        ValueError: a world with ``appears`` or ``breaks``, where the times of departure count, too.
     """
-    return float(tour_lengths(instance, tours).max(initial=0.0))
+    if instance.world == ():
+        return path_lengths(instance.nodes, tours)
+    if instance.waiting_counts:
+        raise ValueError(f"tours alone have no makespan in a world with {list(instance.world)}: use check_log")
+    times = np.zeros(len(tours))
+    for agent, tour in enumerate(tours):
+        legs = [(a, b) for a, b in pairwise(tour) if a != 0 or b != 0]  # staying at the depot is no leg
+        times[agent] = sum(sum(leg_times(instance, agent, k, *leg)) for k, leg in enumerate(legs))
+    return times
+
+
+def leg_times(instance: Instance, agent: int, k: int, start: int, end: int) -> tuple[float, float]:
+    """How long the ``k``-th leg of an agent takes, and the visit after it."""
+    time = math.dist(instance.nodes[start], instance.nodes[end])
+    if instance.speeds is not None:
+        time /= instance.speeds[agent]
+    if instance.traffic is not None:
+        time *= instance.traffic[agent, k % instance.traffic.shape[1]]
+    return float(time), 0.0 if instance.service is None else float(instance.service[end])
+
+
+def makespan(instance: Instance, tours: Sequence[Sequence[int]]) -> float:
+    """Time of the longest tour, the paper's objective (Sec. 3), to be minimised; if plain, its length.
+
+    Raises:
+        ValueError: a world with ``appears`` or ``breaks``: use ``check_log``.
+    """
+    return float(tour_times(instance, tours).max(initial=0.0))
 
 
 def check_tours(instance: Instance, tours: Sequence[Sequence[int]]) -> None:
@@ -134,3 +177,126 @@ def lower_bound(instance: Instance) -> float:
     """
     check_plain(instance)
     return max(farthest_trip(instance.nodes), spanning_tree_length(instance.nodes) / instance.n_agents)
+
+
+# Logs
+
+
+def check_log(instance: Instance, log: Sequence[Sequence[Sequence]], speed: float | None = None) -> float:
+    """Check that a log solves ``instance``, and return its makespan.
+
+    Each agent's legs are (node, departed, arrived, ready), as in ``Leg``: it takes as long as the world says, departs
+    when it is ready, or later if it is at the depot, for cities that have appeared, before it breaks down itself, and
+    comes home in the end. Every city is reached exactly once.
+
+    Args:
+        instance: plain or with any world.
+        log: one list of legs per agent, as ``env.unwrapped.log`` of a finished game.
+        speed: distance per tick of the game, to check that agents decide at the very next tick. None: a tick is at
+            most as long as the shortest time between two departures of the log, and agents may be late by as much.
+
+    Raises:
+        ValueError: the log does not solve the instance; the message names the agent and the leg.
+    """
+    if len(log) != instance.n_agents:
+        raise ValueError(f"expected {instance.n_agents} lists of legs, one per agent, got {len(log)}")
+    legs = [[_as_leg(instance, agent, entry) for entry in entries] for agent, entries in enumerate(log)]
+    tick = _longest_tick(legs) if speed is None else speed
+    own_times = [_check_legs(instance, agent, own, tick, speed is not None) for agent, own in enumerate(legs)]
+    _check_visits(instance, legs)
+    return max(own_times)
+
+
+def _as_leg(instance: Instance, agent: int, entry: Sequence) -> Leg:
+    try:
+        node, *times = entry
+        leg = Leg(int(node), *map(float, times))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"agent {agent}: a leg must be (node, departed, arrived, ready), got {entry!r}") from error
+    if leg.node != node or not 0 <= leg.node < instance.n_nodes:
+        raise ValueError(f"agent {agent} sets off for node {node!r}, outside 0..{instance.n_nodes - 1}")
+    return leg
+
+
+def _longest_tick(legs: Log) -> float:
+    """No tick is longer than this, because all departures are at whole numbers of ticks."""
+    departures = np.unique([0.0, *(leg.departed for own in legs for leg in own)])
+    gaps = np.diff(departures)
+    return float(gaps[gaps > TOLERANCE].min(initial=math.inf))
+
+
+def _check_legs(instance: Instance, agent: int, legs: Sequence[Leg], tick: float, exact: bool) -> float:
+    """Check the legs of one agent; returns its own time at the end.
+
+    Own time is continuous: a leg adds what it takes, not what the clock rounds it up to. If waiting counts, an agent
+    that leaves the depot for a city has the clock's time.
+    """
+    breaks = math.inf if instance.breaks is None else float(instance.breaks[agent])
+    stops = max(_round_up(breaks, tick), tick) if exact else breaks + tick  # it arrives by then, or not at all
+    here, ready, own_time = 0, 0.0, 0.0
+    for k, leg in enumerate(legs):
+        where = f"agent {agent}, leg {k} to node {leg.node}:"
+        _check_departure(leg, here, ready, tick, exact, where)
+        if leg.departed >= breaks - TOLERANCE:
+            raise ValueError(f"{where} it departs at {leg.departed:g}, but broke down at {breaks:g}")
+        if instance.appears is not None and leg.departed < instance.appears[leg.node] - TOLERANCE:
+            raise ValueError(
+                f"{where} it departs at {leg.departed:g}, but the city appears at {instance.appears[leg.node]:g}"
+            )
+        travel, visit = leg_times(instance, agent, k, here, leg.node)
+        arrives = leg.departed + travel
+        if leg.arrived == math.inf and k == len(legs) - 1 and arrives > breaks - TOLERANCE:
+            return breaks
+        if leg.node == 0:
+            arrives = min(arrives, breaks)  # a return leg counts up to the breakdown
+        elif (_round_up(arrives, tick) if exact else arrives) > stops + TOLERANCE:
+            raise ValueError(f"{where} it arrives at {arrives:g}, but broke down at {breaks:g}")
+        for name, said, right in (("arrives", leg.arrived, arrives), ("is ready", leg.ready, arrives + visit)):
+            if not abs(said - right) <= TOLERANCE:
+                raise ValueError(f"{where} it {name} at {right:g}, got {said:g}")
+        if here == 0 and leg.node != 0 and instance.waiting_counts:
+            own_time = leg.departed
+        own_time += travel + visit
+        here, ready = leg.node, max(leg.ready, leg.departed + tick if exact else 0.0)
+    if here == 0:
+        return min(own_time, breaks)
+    if stops > (_round_up(ready, tick) if exact else ready + 2 * tick) + TOLERANCE:
+        raise ValueError(f"agent {agent} does not come home from node {here}")
+    return breaks
+
+
+def _round_up(time: float, tick: float) -> float:
+    """The first tick at or after ``time``, as a time."""
+    return time if math.isinf(time) else math.ceil(time / tick - 1e-9) * tick  # as the rules round
+
+
+def _check_departure(leg: Leg, here: int, ready: float, tick: float, exact: bool, where: str) -> None:
+    """It departs at the first tick at which it is ready, or later from the depot."""
+    if here == leg.node == 0:
+        raise ValueError(f"{where} staying at the depot is no leg")
+    soonest = _round_up(ready, tick) if exact else ready
+    latest = math.inf if here == 0 else soonest if exact else ready + tick
+    if not soonest - TOLERANCE <= leg.departed <= latest + TOLERANCE:
+        when = f"at {soonest:g}" if latest == soonest else f"between {soonest:g} and {latest:g}"
+        raise ValueError(f"{where} it departs {when}, got {leg.departed:g}")
+    if exact and abs(leg.departed - round(leg.departed / tick) * tick) > TOLERANCE * tick:
+        raise ValueError(f"{where} it departs at a whole number of ticks of {tick:g}, got {leg.departed:g}")
+
+
+def _check_visits(instance: Instance, legs: Log) -> None:
+    """Every city is reached once, and before that only by agents that broke down on the way."""
+    attempts: list[list[tuple[float, int, Leg]]] = [[] for _ in range(instance.n_nodes)]
+    for agent, own in enumerate(legs):
+        for leg in own:
+            attempts[leg.node].append((leg.departed, agent, leg))
+    missing = np.array([city for city, tries in enumerate(attempts) if city and _never_reached(tries)], dtype=int)
+    if len(missing):
+        raise ValueError(f"{_cities(missing)} missing from the log")
+    for city, tries in enumerate(attempts[1:], start=1):
+        for (_, agent, leg), (departed, other, _) in pairwise(sorted(tries)):
+            if leg.arrived != math.inf or instance.breaks is None or instance.breaks[agent] > departed + TOLERANCE:
+                raise ValueError(f"agent {other} sets off for city {city} at {departed:g}, which agent {agent} visits")
+
+
+def _never_reached(tries: Sequence[tuple[float, int, Leg]]) -> bool:
+    return all(leg.arrived == math.inf for _, _, leg in tries)

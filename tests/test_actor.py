@@ -110,6 +110,15 @@ def test_torchrls_collector_gathers_whole_episodes(network):
         assert batch["action_mask"].gather(2, batch["action"][..., None]).all()
 
 
+def test_the_log_probability_of_the_action_is_written_if_asked_for(network):
+    td = BatchedMTSP(12, 3, [8], seed=0).reset()
+    torch.manual_seed(0)
+    played = make_actor(network, return_log_prob=True)(td.clone())
+    expected = make_actor(network).get_dist(td).log_prob(played["action"])
+    assert torch.equal(played["action_log_prob"], expected)
+    assert "action_log_prob" not in make_actor(network)(td.clone())
+
+
 @pytest.mark.parametrize("decode", ["greedy", "sample"])
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
 def test_logits_that_are_not_finite_are_named_and_masked_ones_do_not_matter(decode, value):

@@ -14,7 +14,7 @@ from torchrl.envs.utils import check_env_specs, step_mdp
 from mtsp_env import Instance, check_tours, lower_bound, makespan, rules
 from mtsp_env.batched import BatchedMTSP, masked_random_policy, random_legal_action
 
-GAME = [("game", key) for key in ("nodes", *rules.STATE_FIELDS)]
+GAME = [("game", key) for key in ("nodes", *rules.state_fields(()))]
 DEVICES = [
     "cpu",
     pytest.param(
@@ -55,7 +55,7 @@ def test_root_keys_are_the_documented_ones():
     ends = {"done", "terminated", "truncated"}
     assert set(td.keys()) == observed | ends | {"game", "action", "next"}
     assert set(td["next"].keys()) == observed | ends | {"game", "reward"}
-    assert set(td["game"].keys()) == {"nodes", *rules.STATE_FIELDS}
+    assert set(td["game"].keys()) == {"nodes", *rules.state_fields(())}
     assert td["next", "reward"].shape == (6, 1) and td["cities"].dtype == torch.float32
 
 
@@ -342,5 +342,5 @@ def test_a_distribution_may_be_a_function():
         make(distribution=lambda *_: {"nodes": np.zeros((6, 8, 2))}).reset()
     with pytest.raises(ValueError, match="unknown field 'city'"):
         make(distribution=lambda *_: {"nodes": np.zeros((6, 9, 2)), "city": np.zeros((6, 9))}).reset()
-    with pytest.raises(ValueError, match=r"only plain problems .* this one has the world fields \['speeds'\]"):
+    with pytest.raises(ValueError, match=r"\['speeds'\] must come from the scenario"):
         make(distribution=lambda *_: {"nodes": np.zeros((6, 9, 2)), "speeds": np.ones((6, 3))}).reset()

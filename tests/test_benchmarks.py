@@ -47,13 +47,46 @@ def test_the_tables_are_the_papers():
     assert all(cell.count >= 20 for cell in TABLES["1"])
     assert (TABLES["figure4"][0].n_nodes, TABLES["figure4"][-1].n_nodes) == (20, 1000)
     assert {cell.n_agents for cell in TABLES["figure4"]} == {5}
-    labels = [cell.label for cells in TABLES.values() for cell in cells]
-    assert len({cell.file(7) for cells in TABLES.values() for cell in cells}) == len(set(labels))
+    kinds = {(type(cell), cell.label) for cells in TABLES.values() for cell in cells}
+    assert len({cell.file(7) for cells in TABLES.values() for cell in cells}) == len(kinds)
     assert suite.find_cell("3", "gtsp150x20") == TsplibCell("gtsp150", 150, 20, paper_name="kroa150")
     with pytest.raises(ValueError, match=r"unknown table 'none'; choose from \["):
         suite.cells("none")
     with pytest.raises(ValueError, match=r"table 2 has no cell '50x5'; choose from \["):
         suite.find_cell("2", "50x5")
+
+
+def test_the_public_test_set_is_numpys_and_leaves_its_global_generator_alone():
+    for cell in TABLES["seed3333"]:
+        np.random.seed(3333)  # noqa: NPY002 (the definition of the test set)
+        expected = np.random.uniform(size=(100, cell.n_nodes, 2))[: cell.count]  # noqa: NPY002
+        before = np.random.get_state()[1].copy()  # noqa: NPY002
+        instances = cell.instances(3333)
+        assert np.array_equal(np.stack([instance.nodes for instance in instances]), expected), cell.label
+        assert {instance.n_agents for instance in instances} == {cell.n_agents}
+        assert np.array_equal(np.random.get_state()[1], before)  # noqa: NPY002
+
+
+def test_the_public_test_set_has_one_seed_and_100_instances():
+    assert suite.seed_of("seed3333") == 3333 and suite.seed_of("1") == 7 and suite.seed_of("1", 5) == 5
+    with pytest.raises(ValueError, match="the seed of table seed3333 is 3333, got 7"):
+        suite.seed_of("seed3333", 7)
+    with pytest.raises(ValueError, match="the seed of the public test set is 3333, got 7"):
+        TABLES["seed3333"][0].instances(7)
+    with pytest.raises(ValueError, match="instances must be at most 100 in the public test set, got 101"):
+        suite.cells("seed3333", count=101)
+
+
+def test_the_public_test_set_has_the_published_cells():
+    expected = [(50, 5), (50, 7), (50, 10), (100, 5), (100, 7), (100, 10), (200, 10), (200, 15), (200, 20)]
+    expected += [(500, 10), (1000, 10), (500, 30), (1000, 50)]
+    cells = TABLES["seed3333"]
+    assert [(cell.n_nodes, cell.n_agents) for cell in cells] == expected
+    published = json.loads((ROOT / "benchmarks" / "reports" / "published.json").read_text(encoding="utf-8"))
+    table = published["tableseed3333"]
+    assert all(len(m["cost"]) == len(table["cells"]) for m in table.values() if isinstance(m, dict))
+    dpn = dict(zip(map(tuple, table["cells"]), table["DPN"]["cost"], strict=True))
+    assert dpn[100, 5] == 2.2693 and dpn[200, 20] == 1.963 and dpn[500, 30] == 2.0074 and dpn[1000, 50] is None
 
 
 # Best known tours
@@ -120,6 +153,7 @@ def test_the_search_improves_and_the_check_counts_what_is_proved(tmp_path):
 def test_the_kept_best_known_tours_solve_their_instances():
     kept = best_known.kept_cells()
     assert {cell.label for cell, seed in kept if seed == SEED} >= {"50x5", "100x10"}
+    assert {cell.label for cell, seed in kept if seed == 3333} == {cell.label for cell in TABLES["seed3333"]}
     for cell, seed in kept:
         for instance, tours in zip(cell.instances(seed), best_known.read(cell, seed).values(), strict=True):
             assert makespan(instance, tours) >= lower_bound(instance) - 1e-9
@@ -140,6 +174,10 @@ def test_the_command_takes_better_tours_and_verifies(tmp_path, monkeypatch, caps
     (tmp_path / CELL.file(7)).write_text("[[[0, 1, 0], [0, 0]]]")
     assert main(["best", "--check"]) == 2
     assert f"{CELL.file(7)}: instance 0: cities 2, 3" in capsys.readouterr().err
+    assert main(["best", "--check", "--cells", "8x2"]) == 2
+    assert "name the table of the cells ['8x2'] with --table" in capsys.readouterr().err
+    assert main(["best", "--check", "--table", "smoke", "--cells", "9x2"]) == 2
+    assert "unknown cell '9x2'; choose from ['8x2']" in capsys.readouterr().err
     assert main(["best"]) == 2
     assert "choose at least one of --merge FILES, --search SECONDS and --check" in capsys.readouterr().err
 
@@ -148,7 +186,11 @@ def test_the_command_takes_better_tours_and_verifies(tmp_path, monkeypatch, caps
 
 
 @pytest.mark.parametrize(
-    "name", ["random", "nearest", "dan-greedy", "dan-greedy-x8", "dan-s64-x8", "dan-improve", "reference"]
+    "name",
+    [
+        *("random", "nearest", "dan-greedy", "dan-greedy-x8", "dan-s64-x8", "dan-improve", "reference"),
+        *("joint-greedy", "joint-greedy-x8", "joint-s64", "schedulenet-greedy", "schedulenet-s64"),
+    ],
 )
 def test_our_solvers_solve_tiny_instances_and_repeat_themselves(name):
     for instance in [*CELL.instances(0), *Cell(3, 5, 1).instances(0)]:
@@ -167,6 +209,16 @@ def test_naming_solvers_loads_none_and_each_has_a_file():
     assert not missing
 
 
+def test_rows_name_the_weights_behind_every_network():
+    """Solvers with the same weights have the same hash, and a team's weights are part of that of its solver."""
+    hashes = {name: solver.versions().get("weights") for name, solver in solvers.SOLVERS.items()}
+    assert hashes["dan-greedy"] == hashes["dan-s64"] and hashes["joint-greedy"] == hashes["joint-s64"]
+    assert hashes["schedulenet-greedy"] == hashes["schedulenet-s64"] and hashes["hu-greedy"] == hashes["hu-s64"]
+    different = {hashes[f"{name}-greedy"] for name in ("dan", "joint", "dan-paper", "schedulenet", "hu")}
+    assert len(different) == 5 and None not in different
+    assert hashes["nearest"] is hashes["reference"] is None
+
+
 def test_solvers_are_loaded_by_name(tmp_path, monkeypatch):
     (tmp_path / "needy.py").write_text("import a_package_that_nobody_has")
     monkeypatch.syspath_prepend(tmp_path)
@@ -175,6 +227,7 @@ def test_solvers_are_loaded_by_name(tmp_path, monkeypatch):
     dan = ["dan-greedy", "dan-greedy-x8", "dan-s64", "dan-s64-x8", "dan-s256", "dan-improve"]
     assert solvers.expand(["nearest, dan", "dan-s64"]) == ["nearest", *dan]
     assert solvers.expand(["all"]) == list(solvers.SOLVERS)
+    assert solvers.expand(["joint"]) == ["joint-greedy", "joint-greedy-x8", "joint-s64"]
     with pytest.raises(ValueError, match="unknown solver 'magic'; choose from"):
         solvers.find("magic")
     with pytest.raises(ValueError, match="no solver at 'misbehaving:magic'"):

@@ -16,7 +16,7 @@ import pytest
 
 from dan_policy.cli import main
 from mtsp_env.instance import FIELDS, describe_fields
-from mtsp_env.rules import STATE_FIELDS
+from mtsp_env.rules import OBSERVED, STATE_FIELDS
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -150,3 +150,8 @@ def test_the_fields_are_documented_as_they_are(fields: dict) -> None:
 
 def test_the_readme_is_short() -> None:
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 150
+
+
+def test_the_extra_keys_of_worlds_are_documented_as_they_are() -> None:
+    table = describe_fields(OBSERVED).replace("| field |", "| key |")
+    assert table in (ROOT / "docs" / "problem.md").read_text(encoding="utf-8")

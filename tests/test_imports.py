@@ -29,6 +29,8 @@ FORBIDDEN = {
     ],
     "mtsp_env/tours.py": [*FACES, *EXTRAS, "mtsp_env.rules"],
     "mtsp_env/rules.py": [*FACES, *EXTRAS, "gymnasium*", "pettingzoo*", "torch*"],
+    "mtsp_env/state.py": [*FACES, *EXTRAS, "mtsp_env.rules", "mtsp_env.world", "torch*"],
+    "mtsp_env/world.py": [*FACES, *EXTRAS, "mtsp_env.rules", "torch*"],
     "mtsp_env/mtsp_v0.py": ["mtsp_env.batched", "torch*"],
     "mtsp_env/batched.py": ["mtsp_env.mtsp_v0", *EXTRAS],
     "mtsp_env/reference/solver.py": [*FACES, "mtsp_env.render", "mtsp_env.rules"],
@@ -46,12 +48,15 @@ LIGHT = [
     "distributions",
     "files",
     "instance",
+    "log",
     "machine",
     "mtsp_v0",
     "rules",
     "spanning_tree",
+    "state",
     "tours",
     "tsplib",
+    "world",
 ]
 
 

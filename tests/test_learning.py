@@ -21,7 +21,6 @@ CELL = Cell(50, 5, 3)
 
 @pytest.fixture
 def small(monkeypatch):
-    monkeypatch.setattr(ablations, "TRIAL", 0.1)
     monkeypatch.setattr(ablations, "SAMPLES", 2)
     monkeypatch.setattr(ablations, "CELLS", (CELL,))
     monkeypatch.setattr(ablations, "SIZES", {"n_nodes": (6, 8), "n_agents": (2, 2), "nodes_per_agent": 2})
@@ -66,21 +65,69 @@ def test_a_variant_is_trained_in_its_stages(small, tmp_path, variant, stages):
     assert result["weights"] == weights[variant.name]
 
 
+@pytest.mark.slow
+def test_dense_labels_are_those_of_the_variant(small, tmp_path):
+    weighted = ablations.Variant("w", 1.0, {"n_layers": 1}, "joint", next_weight=0.5, assignment_weight=1.0)
+    plain = ablations.Variant("p", 1.0, {"n_layers": 1}, "joint")
+    for variant, labelled in ((weighted, True), (plain, False)):
+        result = ablations.train_and_evaluate(variant, 1.0, 0, tmp_path / variant.name)
+        assert result["imitation_steps"] > 0
+        for name in ("next_loss", "assignment_loss"):
+            with next((tmp_path / variant.name).rglob(f"{name}.csv")).open() as file:
+                losses = [float(row[1]) for row in csv.reader(file)]
+            assert any(losses) is labelled, name
+
+
+@pytest.mark.slow
+def test_an_interrupted_variant_continues_where_it_stopped(small, tmp_path):
+    variant = ablations.Variant("taught", 1.0, {"city_layers": 1})
+    first = ablations.train_and_evaluate(variant, 0.5, 0, tmp_path)
+    again = ablations.train_and_evaluate(variant, 0.5, 0, tmp_path)
+    assert again["imitation_steps"] == first["imitation_steps"] + 1  # no time was left, except for the step begun
+    longer = ablations.train_and_evaluate(variant, again["seconds"] + 0.5, 0, tmp_path)
+    assert longer["imitation_steps"] > again["imitation_steps"]
+    assert longer["seconds"] >= again["seconds"] + 0.5
+
+
+def outcome(variant, seed, gap, minutes=2.0):
+    """A made-up result."""
+    gaps = {cell.label: {"greedy": [gap, 3 * gap], "sample": [gap / 10, 3 * gap / 10]} for cell in ablations.CELLS}
+    rest = {"reinforce_steps": 7, "seconds": 120.0, "weights": 1000, "gaps": gaps, "imitation_steps": 1234}
+    return {"minutes": minutes, "seed": seed, "name": variant.name} | rest
+
+
 def test_saved_results_are_reused_by_the_same_run_only(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(ablations, "VARIANTS", ablations.VARIANTS[:2])
-    gaps = {cell.label: {"greedy": [0.1, 0.3], "sample": [0.01, 0.03]} for cell in ablations.CELLS}
-    for number, variant in enumerate(ablations.VARIANTS):
-        options = {"minutes": 2.0, "seed": 0, "name": variant.name, "imitation_steps": 1234 * number}
-        outcome = {"reinforce_steps": 7, "seconds": 120.0, "weights": 1000, "gaps": gaps}
-        (tmp_path / f"{number}.json").write_text(json.dumps(options | outcome))
-    ablations.main(2.0, tmp_path, 0, tmp_path / "out" / "table.md")
+    monkeypatch.setitem(ablations.STUDIES, "dan", ablations.DAN_VARIANTS[:2])
+    for number, variant in enumerate(ablations.DAN_VARIANTS[:2]):
+        (tmp_path / f"dan-{number}-seed0.json").write_text(json.dumps(outcome(variant, 0, 0.1)))
+    ablations.main("dan", 2.0, (0,), tmp_path, tmp_path / "out" / "table.md")
     table = (tmp_path / "out" / "table.md").read_text()
     both = "| 20.0 ± 10.0 | 2.0 ± 1.0 "
     assert f"| imitation alone {3 * both}| 2.0 | 1,234 | 7 | 1,000 |" in table.splitlines()
-    assert "python -m benchmarks ablations --minutes 2`" in table
+    assert "python -m benchmarks ablations --study dan --minutes 2 --seeds 0`" in table
     with pytest.raises(ValueError, match="belongs to another run"):
-        ablations.main(3.0, tmp_path, 0, tmp_path / "table.md")
+        ablations.main("dan", 3.0, (0,), tmp_path, tmp_path / "table.md")
     assert not (tmp_path / "table.md").exists()
+    with pytest.raises(ValueError, match="name at least one seed"):
+        ablations.main("dan", 2.0, (), tmp_path, tmp_path / "table.md")
+
+
+def test_several_seeds_give_one_line_and_their_own_gaps(tmp_path, monkeypatch, capsys):
+    (variant,) = variants = ablations.DENSE_LABELS[:1]
+    monkeypatch.setitem(ablations.STUDIES, "dense-labels", variants)
+    for seed, gap in ((0, 0.1), (3, 0.2)):
+        (tmp_path / f"dense-labels-0-seed{seed}.json").write_text(json.dumps(outcome(variant, seed, gap)))
+    ablations.main("dense-labels", 2.0, (0, 3), tmp_path, tmp_path / "table.md")
+    lines = (tmp_path / "table.md").read_text().splitlines()
+    both = "| 30.0 ± 15.0 | 3.0 ± 1.5 "  # the mean of two seeds on instances with the gaps 15 % and 45 %
+    assert f"| {variant.name} {3 * both}| 20.0, 40.0 | 2.0 | 1,234 | 7 | 1,000 |" in lines
+
+
+def test_the_study_of_dense_labels_has_every_combination_for_the_joint_network():
+    joint = [variant for variant in ablations.DENSE_LABELS if variant.policy == "joint"]
+    labels = {(variant.next_weight > 0, variant.assignment_weight > 0) for variant in joint}
+    assert labels == {(False, False), (True, False), (False, True), (True, True)} and len(joint) == 4
+    assert {variant.imitation for variant in ablations.DENSE_LABELS} == {1.0}
 
 
 @pytest.mark.slow
@@ -113,5 +160,5 @@ def test_curves_are_trained_until_their_time_is_over(small, tmp_path, monkeypatc
 @pytest.mark.parametrize("minutes", [0.0, -1.0, float("nan")])
 def test_no_time_is_refused(module, minutes, tmp_path):
     with pytest.raises(ValueError, match="minutes must be above 0"):
-        module.main(minutes, tmp_path / "runs")
+        module.main(minutes=minutes, folder=tmp_path / "runs")
     assert not (tmp_path / "runs").exists()

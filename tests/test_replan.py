@@ -50,7 +50,7 @@ def test_games_side_by_side_begin_at_the_same_moment() -> None:
     alone = begin(instance, game, prefixes).arrays()
     for augment in (False, True):
         many = begin(instance, game, prefixes, 11, augment).arrays()
-        for name in ("visits", "destination", "ready", "departed", "leg", "length"):
+        for name in ("visits", "destination", "ready", "departed", "leg", "own_time"):
             np.testing.assert_allclose(many[name], np.repeat(alone[name], 11, axis=0), rtol=0, atol=1e-12)
         distinct = {nodes.round(6).tobytes() for nodes in many["nodes"]}
         assert len(distinct) == (8 if augment else 1)

@@ -12,9 +12,11 @@ from made_up import one_agent_does_it_all, row
 from benchmarks import best_known, suite
 from benchmarks.__main__ import main
 from benchmarks.harness import rows
-from benchmarks.reports import statistics
+from benchmarks.reports import plots, statistics
 from benchmarks.reports.markdown import markdown_table
 from benchmarks.reports.report import report
+from benchmarks.reports.tables import BOUND
+from benchmarks.solvers import SOLVERS
 from mtsp_env import makespan
 
 INSTANCES = suite.cells("smoke")[0].instances(7)
@@ -116,6 +118,36 @@ def test_a_report_by_hand(tmp_path):
     assert "Against" not in report([tmp_path / "rows.jsonl"], against="lkh3")
 
 
+def test_every_table_has_the_trip_to_the_farthest_city_as_a_bound(tmp_path):
+    slow, quick = measured("dan-s64", ALL_BY_ONE), measured("reference", HALVES, budget=0.5)
+    text = report([write(tmp_path / "rows.jsonl", [*slow, *quick])])
+    bounds = np.array([2 * max(math.dist(i.nodes[0], city) for city in i.nodes[1:]) for i in INSTANCES])
+    mean, error = bounds.mean(), bounds.std(ddof=1) / math.sqrt(3)
+    assert line_of(text, "Makespan", BOUND) == [f"{mean:.3f} ± {error:.3f}"]
+    gaps = 100 * (bounds / np.minimum(COSTS["one"], COSTS["halves"]) - 1)
+    assert (gaps < 0).all()
+    mean, error = gaps.mean(), gaps.std(ddof=1) / math.sqrt(3)
+    assert line_of(text, "Gap", BOUND) == [f"{mean:.2f} ± {error:.2f}", f"{mean:.2f} ± {error:.2f} (3)"]
+
+
+def test_the_public_test_set_is_compared_with_published_numbers_of_the_same_instances(tmp_path, monkeypatch):
+    """The published gap is that of the means over all 100 instances, however few of them have rows."""
+    cell = suite.find_cell("seed3333", "100x5")
+    tours = one_agent_does_it_all(cell.instances(3333)[0])
+    kept = tmp_path / "kept"
+    result = row(cell.instances(3333)[0], tours, 0, "100x5", "seed3333", method="joint-greedy", seed=3333)
+    path = write(tmp_path / "rows.jsonl", [result])
+    monkeypatch.setattr(statistics.load, "__defaults__", (None, kept))
+    text = report([path])
+    assert line_of(text, "Makespan", "*DPN, published*") == ["2.2693"]
+    assert "*DPN, published*" not in text.split("### Gap")[1].split("###")[0]  # no best known tours yet
+    best_known.merge(cell, 3333, dict.fromkeys(range(100), tours), kept)
+    mean = np.mean([makespan(i, tours) for i in cell.instances(3333)])
+    assert line_of(report([path]), "Gap", "*DPN, published*") == [f"{100 * (2.2693 / mean - 1):.2f}", ""]
+    report([path], out=tmp_path / "report")
+    assert (tmp_path / "report" / "gaps-seed3333.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_failures_are_counted_in_notes(tmp_path):
     good, bad = measured("reference", HALVES, budget=1.0), measured("lkh3", HALVES, budget=1.0)
     late = failed(bad[0], "timeout", "killed 10 s after its limit of 1 s")
@@ -202,8 +234,8 @@ def test_published_numbers_stand_beside_measured_ones(tmp_path):
         line.split("|")[1].strip() for line in text.split("### Makespan")[1].split("###")[0].splitlines() if "|" in line
     ]
     order = ["*DAN s.64, published*", "dan-s64", "*OR-Tools, published*", "ortools", "*LKH3, Kim et al. 2022*", "lkh3"]
-    assert names[-6:] == order
-    assert "*EA, published*" in names[2:-6]
+    assert names[-7:] == [*order, BOUND]
+    assert "*EA, published*" in names[2:-7]
 
 
 def test_table_3_has_both_lengths_and_names_the_mix_up(tmp_path):
@@ -224,6 +256,11 @@ def test_table_3_has_both_lengths_and_names_the_mix_up(tmp_path):
     assert line_of(text, "Longest tour, every leg", "*DAN s.256, published*") == ["1610"]
     assert line_of(text, "Longest tour, every leg", "dan-s256") == [str(result.rounded_length)]
     assert line_of(text, "Longest tour, not rounded", "dan-s256") == [f"{result.length:.1f}"]
+    assert line_of(text, "Longest tour, not rounded", BOUND) == ["-"]  # the file was not given
+    farthest = np.linalg.norm(xy - xy[0], axis=1).max()
+    text_with_file = report([path], tsplib=folder)
+    assert line_of(text_with_file, "Longest tour, every leg", BOUND) == [str(2 * int(farthest + 0.5))]
+    assert line_of(text_with_file, "Longest tour, not rounded", BOUND) == [f"{2 * farthest:.1f}"]
     assert "gtsp150, 10 (1)" in text and "under the name kroa150" in text and "For 1 of 1 instances the best" in text
     write(path, [replace(result, makespan=0.5)])
     report([path])  # without the files nothing is checked
@@ -246,6 +283,11 @@ def test_a_folder_gets_the_tables_and_the_pictures(tmp_path, capsys):
     for name in names[1:]:
         assert (out / name).read_bytes().startswith(b"\x89PNG")
         assert f"]({name})" in (out / "report.md").read_text(encoding="utf-8")
+
+
+def test_every_solver_has_a_style_of_its_own():
+    assert set(plots.STYLE) == set(SOLVERS)
+    assert len(set(plots.STYLE.values())) == len(SOLVERS)
 
 
 def test_rows_come_back_as_they_were_written():

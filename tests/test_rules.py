@@ -38,7 +38,9 @@ def odd_games(draw: st.DrawFn) -> Game:
         reward=draw(st.sampled_from(rules.REWARDS)),
         max_decisions=draw(st.none() | st.integers(1, n + m)),
     )
-    return Game(np.array([nodes]), m, game_rules, (draw(st.sampled_from(PLAYERS)),), draw(st.integers(0, 2**16)))
+    return Game(
+        {"nodes": np.array([nodes])}, m, game_rules, (draw(st.sampled_from(PLAYERS)),), draw(st.integers(0, 2**16))
+    )
 
 
 @settings(max_examples=250, deadline=None, derandomize=True, database=None)
@@ -56,7 +58,7 @@ def test_odd_games_are_algorithm_1s(game: Game) -> None:
 def walk(seed: int, array: Callable = np.array) -> tuple[Game, list[rules.State]]:
     """Random games and all their states under the oracle's actions, from the start to two steps beyond the last end."""
     game, traces = play_random(seed)
-    state = rules.start(Problem(game.n_agents, {"nodes": array(game.nodes)}))
+    state = rules.start(Problem(game.n_agents, {"nodes": array(game.nodes)}), game.rules)
     states, actions = [state], [trace.actions for trace in traces]
     for k in range(max(map(len, actions)) + 2):
         state = rules.depart(state, game.rules, array([row[k] if k < len(row) else 0 for row in actions]))
@@ -100,7 +102,7 @@ def test_shaped_rewards_sum_to_the_sparse_one(seed: int) -> None:
     for kind in rules.REWARDS:
         game_rules = rules.Rules(game.rules.speed, game.rules.depot, kind, game.rules.max_decisions)
         over = np.array(
-            [rules.all_visited(state) | rules.truncated(state, game_rules) for state in states]
+            [rules.terminated(state) | rules.truncated(state, game_rules) for state in states]
         )  # (decisions + 1, B)
         paid = np.array([rules.reward(*pair, game_rules) for pair in pairwise(states)])  # (decisions, B)
         assert kind == "shaped" or not paid[~over[1:]].any()  # sparse: nothing before the end
@@ -113,7 +115,7 @@ def test_shaped_rewards_sum_to_the_sparse_one(seed: int) -> None:
 def test_states_keep_their_shape_and_masks_are_never_empty(seed: int, array: Callable) -> None:
     game, states = walk(seed, array)
     for state in states:
-        described = {"nodes": FIELDS["nodes"], **rules.STATE_FIELDS}
+        described = {"nodes": FIELDS["nodes"], **rules.state_fields(())}
         assert state.arrays().keys() == described.keys()
         for name, x in state.arrays().items():
             sizes = described[name].sizes(game.nodes.shape[1], game.n_agents)
@@ -124,7 +126,7 @@ def test_states_keep_their_shape_and_masks_are_never_empty(seed: int, array: Cal
             assert not (seen.action_mask[:, 1:] & seen.visited[:, 1:]).any()
             assert not seen.visited[:, 0].any()
             assert not seen.agents[:, agent, :2].any()  # it sees the world from its destination
-            assert [_kind(x) for x in seen] == ["float32", "float32", "bool", "bool", "int64"]
+            assert [_kind(x) for x in seen.arrays().values()] == ["float32", "float32", "bool", "bool", "int64"]
 
 
 def _kind(array: rules.Array) -> str:
@@ -138,8 +140,8 @@ def test_finished_games_stand_still(seed: int) -> None:
     game, states = walk(seed)
     game_rules = game.rules
     for before, after in pairwise(states):
-        over = rules.all_visited(before)
-        assert (rules.all_visited(after) | ~over).all()
+        over = rules.terminated(before)
+        assert (rules.terminated(after) | ~over).all()
         assert rules.makespan(after)[over] == pytest.approx(rules.makespan(before)[over], abs=1e-12)
         assert (
             rules.legal_actions(before, game_rules, rules.agent_to_decide(before))[over].sum() == over.sum()
@@ -151,9 +153,10 @@ def test_finished_games_stand_still(seed: int) -> None:
 
 
 def test_depart_changes_nothing_in_place() -> None:
-    state = rules.start(Problem(3, {"nodes": np.random.default_rng(0).random((2, 6, 2))}))
+    game_rules = rules.make_rules(6, 3, 0.1, "open", "sparse", None)
+    state = rules.start(Problem(3, {"nodes": np.random.default_rng(0).random((2, 6, 2))}), game_rules)
     copies = {name: array.copy() for name, array in state.arrays().items()}
-    rules.depart(state, rules.make_rules(6, 3, 0.1, "open", "sparse", None), np.array([2, 3]))
+    rules.depart(state, game_rules, np.array([2, 3]))
     assert all(np.array_equal(array, copies[name]) for name, array in state.arrays().items())
 
 
@@ -163,12 +166,14 @@ def test_every_policy_ends(depot: str, size: tuple[int, int]) -> None:
     """Also the policy that stays at the depot if it may; "final" within n - 1 + m decisions, all cities visited."""
     policies = [*PLAYERS, lambda oracle, rng: int(np.argmax(oracle.legal_actions()))]
     game_rules = rules.make_rules(*size, 0.01, depot, "sparse", None)
-    game = Game(np.random.default_rng(1).random((4, size[0], 2)), size[1], game_rules, tuple(policies), seed=2)
+    game = Game(
+        {"nodes": np.random.default_rng(1).random((4, size[0], 2))}, size[1], game_rules, tuple(policies), seed=2
+    )
     traces = play(game)
     check_face("numpy", game, traces)
     for trace in traces:
-        assert len(trace.actions) <= (game_rules.max_decisions if depot == "open" else sum(size) - 1)
-        assert depot == "open" or not trace.end.truncated
+        assert len(trace.actions) <= (game_rules.max_decisions if depot != "final" else sum(size) - 1)
+        assert depot != "final" or not trace.end.truncated
     assert not traces[0].end.truncated and not traces[2].end.truncated
 
 
@@ -210,7 +215,7 @@ def test_the_depot_rules_by_hand(
     """Two agents, four cities at ten ticks from the depot."""
     nodes = np.array([[0.5, 0.5], [0.5, 0.6], [0.5, 0.4], [0.6, 0.5], [0.4, 0.5]])
     game_rules = rules.make_rules(5, 2, 0.01, depot, "sparse", None)
-    oracle, state = Oracle(nodes, 2, 0.01, depot), rules.start(Problem(2, {"nodes": nodes[None]}))
+    oracle, state = Oracle(nodes, 2, 0.01, depot), rules.start(Problem(2, {"nodes": nodes[None]}), game_rules)
     for action, legal, tick in zip(actions, depot_is_legal, ticks, strict=True):
         assert (
             rules.legal_actions(state, game_rules, rules.agent_to_decide(state))[0, 0]
@@ -220,7 +225,7 @@ def test_the_depot_rules_by_hand(
         assert state.ready.min() == oracle.tick == tick
         oracle.step(action)
         state = rules.depart(state, game_rules, np.array([action]))
-    assert state.length[0].tolist() == pytest.approx(lengths)
+    assert state.own_time[0].tolist() == pytest.approx(lengths)
 
 
 @pytest.mark.parametrize("speed", [0.1, 0.01])
@@ -241,9 +246,12 @@ def test_whole_numbers_of_ticks(array: Callable, speed: float) -> None:
         ({"speed": 0.0}, "speed must be .* at least 1e-9, got 0.0"),
         ({"speed": float("nan")}, "speed must be"),
         ({"speed": float("inf")}, "speed must be"),
-        ({"depot": "closed"}, r"unknown depot rule 'closed'; choose from \['open', 'final'\]"),
+        ({"depot": "closed"}, r"unknown depot rule 'closed'; choose from \['open', 'wait', 'final'\]"),
         ({"reward": "dense"}, r"unknown reward 'dense'; choose from \['sparse', 'shaped'\]"),
         ({"max_decisions": 0}, "max_decisions must be a whole number of at least 1, got 0"),
+        ({"view": 0}, "view must be a whole number of at least 1, got 0"),
+        ({"hearing": -0.1}, "hearing must be a finite distance of at least 0, or None, got -0.1"),
+        ({"hearing": float("nan")}, "hearing must be a finite distance of at least 0, or None, got nan"),
     ],
     ids=lambda x: "=".join(map(str, *x.items())) if isinstance(x, dict) else "",
 )

@@ -44,7 +44,7 @@ class Judge:
 
     def __init__(self, tsplib: Path | None) -> None:
         self.tsplib = tsplib
-        self.drawn: dict[tuple, list[Instance]] = {}
+        self.drawn: dict[str, list[Instance]] = {}
 
     def check(self, row: Row) -> None:
         cell = find_cell(row.table, row.cell)
@@ -57,7 +57,7 @@ class Judge:
             raise ValueError(f"its makespan is {row.makespan!r}, that of its tours {judged!r}")
 
     def _instance(self, cell: AnyCell, seed: int, number: int) -> Instance:
-        key = (cell.label, seed)
+        key = cell.file(seed)
         if len(self.drawn.get(key, [])) <= number:
             if isinstance(cell, TsplibCell):
                 cell = replace(cell, folder=self.tsplib)

@@ -27,7 +27,7 @@ def run(
     out: Path,
     methods: tuple[str, ...] = ("nearest", "dan-greedy", "dan-s64", "reference"),
     instances: int | None = None,
-    seed: int = suite.SEED,
+    seed: int | None = None,
     seconds: tuple[float, ...] = (1.0,),
     limit: float = 600.0,
     grace: float = 10.0,
@@ -40,12 +40,12 @@ def run(
     """Solve a table's instances with every method and append a row of JSON for each; existing rows are not run again.
 
     Args:
-        table: 1, 2, 3, figure4 or smoke.
+        table: 1, 2, 3, figure4, seed3333 or smoke.
         out: file of JSON lines to append to.
         methods: names of solvers or groups (dan, all), separated by spaces or commas; package.module:function names a
             solver of your own.
         instances: number of instances in each cell; by default the table's.
-        seed: seed of the instances; best known tours are kept for seed 7.
+        seed: seed of the instances; by default 7, and 3333 for the table seed3333: best known tours are kept for these.
         seconds: budgets for the solvers that take one; each budget gives a row.
         limit: seconds that the other solvers may take.
         grace: seconds beyond its budget or limit after which a solver is killed.
@@ -73,8 +73,8 @@ def run(
         if method not in solvers.SOLVERS:
             solvers.find(method)  # a misspelt name should not fill the file with errors
     versions = {method: solvers.look_up(method).versions() for method in methods}
-    chosen = _choose(suite.cells(table, tsplib, instances), cells)
-    jobs = make_jobs(chosen, table, methods, seed, seconds)
+    chosen = suite.choose(suite.cells(table, tsplib, instances), cells)
+    jobs = make_jobs(chosen, table, methods, suite.seed_of(table, seed), seconds)
     count = failed = 0
     with Journal(out) as journal:
         _check_weights(out, journal.rows, versions)
@@ -90,15 +90,6 @@ def run(
                     count, failed = count + 1, failed + (not row.ok)
                     progress.update(task, advance=1, failed=failed)
     return f"{out}: {count} new rows, {failed} of them failed"
-
-
-def _choose(cells: Sequence[suite.AnyCell], labels: Sequence[str]) -> list[suite.AnyCell]:
-    """The cells with these labels; all if there are no labels."""
-    known = [cell.label for cell in cells]
-    for label in labels:
-        if label not in known:
-            raise ValueError(f"unknown cell {label!r}; choose from {known}")
-    return [cell for cell in cells if not labels or cell.label in labels]
 
 
 def _check_weights(out: Path, rows: Sequence[Row], versions: dict[str, dict[str, str]]) -> None:

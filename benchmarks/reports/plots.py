@@ -11,10 +11,11 @@ from matplotlib.ticker import FuncFormatter, NullLocator
 
 from benchmarks.reports.statistics import Results, mean
 from benchmarks.solvers import SOLVERS
-from benchmarks.suite import AnyCell, Cell
+from benchmarks.suite import AnyCell, TsplibCell
 from mtsp_env.writing import atomic_write
 
-# A colour and a marker for each method: warm colours for DAN, black for the reference, cold ones for the others
+# A colour and a marker for each method: warm colours for DAN and the joint network, brown and pink for other papers'
+# networks, black for the reference, cold ones for the others
 STYLE = {
     "random": ("0.75", "x"),
     "nearest": ("0.5", "X"),
@@ -25,7 +26,15 @@ STYLE = {
     "dan-s256": ("#d73027", "o"),
     "dan-paper-greedy": ("#c9a227", "o"),
     "dan-paper-s64": ("#c9a227", "p"),
+    "joint-greedy": ("#fb6a4a", "H"),
+    "joint-greedy-x8": ("#fb6a4a", "8"),
+    "joint-s64": ("#a50f15", "H"),
     "dan-improve": ("#8c1c13", "P"),
+    "schedulenet-greedy": ("#8c6d31", "o"),
+    "schedulenet-greedy-x8": ("#8c6d31", "d"),
+    "schedulenet-s64": ("#5f4b1b", "o"),
+    "hu-greedy": ("#ce6dbd", "o"),
+    "hu-s64": ("#7b4173", "o"),
     "reference": ("black", "*"),
     "ortools": ("#4575b4", "s"),
     "ortools-gls": ("#74add1", "s"),
@@ -65,7 +74,7 @@ def gaps(results: Results, path: Path) -> None:
 
 
 def _title(results: Results, cell: AnyCell) -> str:
-    name = f"n = {cell.n_nodes}" if isinstance(cell, Cell) else cell.file_name
+    name = cell.file_name if isinstance(cell, TsplibCell) else f"n = {cell.n_nodes}"
     return f"{name}, m = {cell.n_agents} ({len(results.instances(cell.label))})"
 
 

@@ -19,6 +19,7 @@ TITLES = {
     "2": "Table 2: uniform instances, n from 500 on",
     "3": "Table 3: TSPLIB",
     "figure4": "Figure 4: planning time at m = 5",
+    "seed3333": "The public test set, seed 3333",
     "smoke": "Smoke test",
 }
 
@@ -77,8 +78,9 @@ def _origin(all_results: Sequence[Results], files: Sequence[Path]) -> list[str]:
     return [
         f"From {', '.join(file.name for file in files)}: {len(rows)} rows, test set seed {', '.join(map(str, seeds))}. "
         "Every solver has one thread. ± is the standard error of the mean. Superscripts refer to the notes below a "
-        "table. *Published* numbers are those of the papers, measured on other instances of the same kind and on other "
-        "machines.",
+        "table. *Published* numbers are those of the papers, measured on other machines and, except for the public "
+        "test set, on other instances of the same kind. The *bound* is the trip to the farthest city and back: no "
+        "makespan is smaller.",
         "",
         *(f"- {machine}: {count} rows" for machine, count in machines.most_common()),
         f"- {', '.join(versions)}",

@@ -16,8 +16,18 @@ from benchmarks import best_known
 from benchmarks.harness.judge import TIE, read_judged
 from benchmarks.harness.rows import Row
 from benchmarks.solvers import SOLVERS
-from benchmarks.suite import TABLES, AnyCell, TsplibCell, cells
-from mtsp_env.tours import makespan
+from benchmarks.suite import (
+    PUBLIC_SEED,
+    PUBLIC_SIZE,
+    TABLES,
+    AnyCell,
+    PublicCell,
+    TsplibCell,
+    cells,
+    rounded_length,
+)
+from mtsp_env.instance import Instance
+from mtsp_env.tours import farthest_trip, makespan
 
 InstanceKey = tuple[int, int]
 """An instance of a cell: (seed, number)."""
@@ -47,6 +57,14 @@ class Comparison(NamedTuple):
     difference: float
 
 
+class Bound(NamedTuple):
+    """The trip from the depot to the farthest city and back, a lower bound on the makespan. Fields as in ``Row``."""
+
+    makespan: float
+    length: float
+    rounded_length: int
+
+
 @dataclass(frozen=True)
 class Results:
     """The results of one table.
@@ -57,6 +75,9 @@ class Results:
         labels: methods, each with its budget if it takes one, in the order of SOLVERS.
         rows: label -> cell -> instance -> row.
         best: cell -> instance -> makespan of the best known tours, those of these rows included.
+        bounds: cell -> instance -> lower bound; cells whose TSPLIB file was not given are left out.
+        public_best: cell of the public test set -> mean makespan of the best known tours of all its 100 instances;
+            cells in which some instance has none are left out.
         unkept: number of instances without kept tours, or without the TSPLIB file to judge them by.
     """
 
@@ -65,6 +86,8 @@ class Results:
     labels: list[str]
     rows: dict[str, dict[str, dict[InstanceKey, Row]]]
     best: dict[str, dict[InstanceKey, float]]
+    bounds: dict[str, dict[InstanceKey, Bound]]
+    public_best: dict[str, float]
     unkept: int
 
     def all_rows(self) -> list[Row]:
@@ -143,26 +166,50 @@ def _results(table: str, table_rows: Sequence[Row], tsplib: Path | None, folder:
             best[row.cell][key] = min(row.makespan, best[row.cell].get(key, math.inf))
     present = [cell for cell in cells(table) if any(row.cell == cell.label for row in table_rows)]
     unkept = sum(map(len, best.values()))
+    bounds: dict[str, dict[InstanceKey, Bound]] = defaultdict(dict)
+    public_best = {}
     for cell in present:
         if isinstance(cell, TsplibCell):
             if tsplib is None:
                 continue
             cell = replace(cell, folder=tsplib)
         for seed in {row.seed for row in table_rows if row.cell == cell.label}:
-            unkept -= _include_kept(best[cell.label], cell, seed, folder)
+            numbers = {row.instance for row in table_rows if (row.cell, row.seed) == (cell.label, seed)}
+            if not isinstance(cell, TsplibCell):
+                cell = replace(cell, count=max(numbers) + 1)
+            instances = cell.instances(seed)
+            bounds[cell.label] |= {(seed, number): bound(instances[number]) for number in numbers}
+            unkept -= _include_kept(best[cell.label], cell, instances, seed, folder)
+        if isinstance(cell, PublicCell):
+            public_best |= _public_best(replace(cell, count=PUBLIC_SIZE), folder)
     order = {name: place for place, name in enumerate(SOLVERS)}
     example = {row.label: row for row in table_rows}
     labels = sorted(example, key=lambda x: (order.get(example[x].method, len(order)), example[x].budget or 0.0, x))
-    return Results(table, present, labels, {label: dict(rows[label]) for label in labels}, dict(best), unkept)
+    by_label = {label: dict(rows[label]) for label in labels}
+    return Results(table, present, labels, by_label, dict(best), dict(bounds), public_best, unkept)
 
 
-def _include_kept(best: dict[InstanceKey, float], cell: AnyCell, seed: int, folder: Path) -> int:
+def bound(instance: Instance) -> Bound:
+    """The lower bound of an instance."""
+    farthest = int(np.linalg.norm(instance.nodes - instance.nodes[0], axis=1).argmax())
+    trip = farthest_trip(instance.nodes)
+    return Bound(trip, trip * instance.scale, rounded_length(instance, [[0, farthest, 0]]))
+
+
+def _include_kept(
+    best: dict[InstanceKey, float], cell: AnyCell, instances: Sequence[Instance], seed: int, folder: Path
+) -> int:
     """Lower a cell's ``best`` makespans to those of its kept tours; returns the number of instances that have any."""
-    numbers = [number for row_seed, number in best if row_seed == seed]
-    if numbers and not isinstance(cell, TsplibCell):
-        cell = replace(cell, count=max(numbers) + 1)
-    instances = cell.instances(seed)
-    kept = {i: tours for i, tours in best_known.read(cell, seed, folder).items() if i in numbers}
+    kept = {i: tours for i, tours in best_known.read(cell, seed, folder).items() if (seed, i) in best}
     for i, tours in kept.items():
         best[seed, i] = min(best[seed, i], makespan(instances[i], tours))
     return len(kept)
+
+
+def _public_best(cell: PublicCell, folder: Path) -> dict[str, float]:
+    """The mean makespan of a cell's kept tours under its label; nothing unless every instance has any."""
+    kept = best_known.read(cell, PUBLIC_SEED, folder)
+    if len(kept) < cell.count:
+        return {}
+    instances = cell.instances(PUBLIC_SEED)
+    return {cell.label: float(np.mean([makespan(instances[i], tours) for i, tours in kept.items()]))}

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from benchmarks.harness.rows import Row
 from benchmarks.reports.markdown import markdown_table
-from benchmarks.reports.statistics import Comparison, Mean, Results, mean
+from benchmarks.reports.statistics import Bound, Comparison, Mean, Results, mean
 from benchmarks.solvers.exact import PROVED
 from benchmarks.suite import TsplibCell
 
@@ -26,7 +26,11 @@ COUNTERPARTS = {
     "Gurobi": "exact",
     "EA": "ea",
     "SOM": "som",
+    "Park et al. (ScheduleNet)": "schedulenet-greedy",
+    "Hu et al.": "hu-greedy",
 }
+
+BOUND = "*bound: to the farthest city and back*"
 
 Line = tuple[str, list[str]]
 """A line of a table: its first cell and a cell for each column."""
@@ -40,11 +44,15 @@ def section(results: Results, against: str) -> list[str]:
         rounded = _means(results, notes, lambda row: row.rounded_length, ".0f")
         exact = _means(results, notes, lambda row: row.length, ".1f")
         lines += ["### Longest tour, every leg rounded as TSPLIB does (so are the published ones)", ""]
-        lines += [_table(results, _with_published(results, rounded, "cost"))]
+        rounded = [*_with_published(results, rounded, "cost"), _bounds(results, lambda b: b.rounded_length, ".0f")]
+        exact.append(_bounds(results, lambda bound: bound.length, ".1f"))
+        lines += [_table(results, rounded)]
         lines += ["", "### Longest tour, not rounded", "", _table(results, exact)]
     else:
         costs = _means(results, notes, lambda row: row.makespan, ".3f")
-        lines += ["### Makespan", "", _table(results, _with_published(results, costs, "cost", ".2f"))]
+        costs = _with_published(results, costs, "cost", ".4f" if results.table == "seed3333" else ".2f")
+        costs.append(_bounds(results, lambda bound: bound.makespan, ".3f"))
+        lines += ["### Makespan", "", _table(results, costs)]
     lines += ["", "### Gap to the best known tours of the same instances, %", "", _gaps(results, notes)]
     seconds = _means(results, notes, lambda row: row.seconds, ".3g", error=False)
     lines += ["", "### Seconds", "", _table(results, _with_published(results, seconds, "seconds"))]
@@ -94,6 +102,11 @@ class Notes:
                 f"For {self.results.unkept} of {total} instances the best known tours are those of these rows: "
                 "no others are kept, or the TSPLIB files to check them were not given."
             )
+        if self.results.table == "seed3333":
+            remarks.append(
+                "Published means are of all 100 instances of the public test set. Their gaps are to the mean of the "
+                "best known makespans of the same instances, in the cells in which all 100 have best known tours."
+            )
         numbered = ["", *(f"{i}. {text}" for i, text in enumerate(self.texts, 1))] if self.texts else []
         return numbered + [line for text in remarks for line in ("", text)]
 
@@ -120,6 +133,12 @@ def _means(results: Results, notes: Notes, value: Callable[[Row], float], style:
             columns.append(_number(average, style, error) + notes.mark(label, cell.label))
         lines.append((label, columns))
     return lines
+
+
+def _bounds(results: Results, value: Callable[[Bound], float], style: str) -> Line:
+    """The mean of ``value`` of the lower bounds of each cell's instances."""
+    means = [mean([value(bound) for bound in results.bounds.get(cell.label, {}).values()]) for cell in results.cells]
+    return BOUND, [_number(average, style) for average in means]
 
 
 def _number(average: Mean | None, style: str, error: bool = True) -> str:
@@ -174,8 +193,35 @@ def _gaps(results: Results, notes: Notes) -> str:
         ]
         all_gaps = [gap for gaps in by_cell for gap in gaps]
         lines.append((label, [*columns, f"{_number(mean(all_gaps), '.2f')} ({len(all_gaps)})"]))
+    lines = [*_published_gaps(results), *lines, _bound_gaps(results)]
     total = sum(len(results.instances(cell.label)) for cell in results.cells)
     return _table(results, lines, f"all ({total})")
+
+
+def _bound_gaps(results: Results) -> Line:
+    """The lower bounds' distance below the best known makespans, as negative gaps in per cent."""
+    by_cell = []
+    for cell in results.cells:
+        bounds, best = results.bounds.get(cell.label, {}), results.best.get(cell.label, {})
+        by_cell.append([100 * (bounds[key].makespan / best[key] - 1) for key in bounds.keys() & best.keys()])
+    every = [gap for gaps in by_cell for gap in gaps]
+    columns = [_number(mean(gaps), ".2f") for gaps in by_cell]
+    return BOUND, [*columns, f"{_number(mean(every), '.2f')} ({len(every)})"]
+
+
+def _published_gaps(results: Results) -> list[Line]:
+    """For the public test set: published means against the mean best known makespan of the same 100 instances."""
+    lines = []
+    for name, columns in _published(results, "cost", ".8g").items() if results.public_best else ():
+        gaps = [
+            f"{round(100 * (float(text) / results.public_best[cell.label] - 1), 2) + 0.0:.2f}"  # never -0.00
+            if text and cell.label in results.public_best
+            else ""
+            for text, cell in zip(columns, results.cells, strict=True)
+        ]
+        if any(gaps):
+            lines.append((f"*{name}*", [*gaps, ""]))
+    return lines
 
 
 def _comparisons(results: Results, other: str) -> list[str]:

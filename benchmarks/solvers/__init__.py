@@ -22,7 +22,7 @@ from mtsp_env.instance import Instance, Tours
 
 
 class Unavailable(RuntimeError):
-    """The solver cannot run because a package, a program or a licence is missing. The message says which."""
+    """The solver cannot run because a package, a program, a licence or weights are missing. The message says which."""
 
 
 class NoTours(RuntimeError):
@@ -41,6 +41,9 @@ class Answer(NamedTuple):
     bound: float | None = None
 
 
+WEIGHTS = Path(__file__).parents[1] / "policies" / "weights"
+"""Folder with the weights of other papers' networks."""
+
 Solve = Callable[[Instance, float, int], "Tours | Answer"]
 
 
@@ -56,7 +59,8 @@ class Solver:
         polishes: whether its budget begins only when it has first tours.
         packages: distributions whose versions are recorded with a result.
         programs: programs that are used instead of a package if they are on the PATH.
-        weights: name of the shipped model that it uses, whose hash is recorded with a result.
+        weights: names of the models that it uses, whose hash is recorded with a result: those shipped with
+            ``dan_policy``, or in ``benchmarks/policies/weights``.
     """
 
     target: str
@@ -65,7 +69,7 @@ class Solver:
     polishes: bool = False
     packages: tuple[str, ...] = ("numpy",)
     programs: tuple[str, ...] = ()
-    weights: str | None = None
+    weights: tuple[str, ...] = ()
 
     def load(self) -> Solve:
         """Import the function ``solve(instance, seconds, seed)``.
@@ -94,14 +98,20 @@ class Solver:
         for program in self.programs:
             if path := shutil.which(program):
                 versions[program] = _digest(Path(path))
-        if self.weights is not None:
-            folder = Path(find_spec("dan_policy").origin).parent / "weights"
-            versions["weights"] = _digest(folder / f"{self.weights}.safetensors")
+        if self.weights:
+            versions["weights"] = _digest(*map(_weights_file, self.weights))
         return versions
 
 
-def _digest(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()[:12]
+def _weights_file(name: str) -> Path:
+    """The file of a model, found without importing torch."""
+    shipped = Path(find_spec("dan_policy").origin).parent / "weights" / f"{name}.safetensors"
+    return shipped if shipped.exists() else WEIGHTS / shipped.name
+
+
+def _digest(*files: Path) -> str:
+    """The beginning of the SHA-256 of these files, one after the other."""
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
 
 
 def _ours(
@@ -110,9 +120,10 @@ def _ours(
     anytime: bool = True,
     polishes: bool = False,
     programs: tuple[str, ...] = (),
-    weights: str | None = None,
+    weights: tuple[str, ...] | str = (),
     **options: Any,
 ) -> Solver:
+    weights = (weights,) if isinstance(weights, str) else weights
     return Solver(f"{__name__}.{target}", options, anytime, polishes, ("numpy", *packages), programs, weights)
 
 
@@ -130,7 +141,15 @@ SOLVERS: dict[str, Solver] = {
     "dan-s256": _policy("dan", weights="default", samples=256),
     "dan-paper-greedy": _policy("dan", weights="paper", policy="paper"),
     "dan-paper-s64": _policy("dan", weights="paper", policy="paper", samples=64),
+    "joint-greedy": _policy("dan", weights="joint", policy="joint"),
+    "joint-greedy-x8": _policy("dan", weights="joint", policy="joint", augment=True),
+    "joint-s64": _policy("dan", weights="joint", policy="joint", samples=64),
     "dan-improve": _policy("improved_dan", "numba", anytime=True, polishes=True, weights="default"),
+    "schedulenet-greedy": _policy("schedulenet", weights="schedulenet"),
+    "schedulenet-greedy-x8": _policy("schedulenet", weights="schedulenet", augment=True),
+    "schedulenet-s64": _policy("schedulenet", weights="schedulenet", samples=64),
+    "hu-greedy": _ours("hu:solve", "torch", "ortools", anytime=False, weights=("hu-5", "hu-10")),
+    "hu-s64": _ours("hu:solve", "torch", "ortools", anytime=False, weights=("hu-5", "hu-10"), samples=64),
     "reference": _ours("reference:solve", "numba"),
     "ortools": _ours("ortools:solve", "ortools", search="greedy_descent"),
     "ortools-gls": _ours("ortools:solve", "ortools", search="guided"),
@@ -145,6 +164,9 @@ SOLVERS: dict[str, Solver] = {
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "dan": ("dan-greedy", "dan-greedy-x8", "dan-s64", "dan-s64-x8", "dan-s256", "dan-improve"),
+    "schedulenet": ("schedulenet-greedy", "schedulenet-greedy-x8", "schedulenet-s64"),
+    "hu": ("hu-greedy", "hu-s64"),
+    "joint": ("joint-greedy", "joint-greedy-x8", "joint-s64"),
     "all": tuple(SOLVERS),
 }
 

@@ -1,12 +1,17 @@
-"""Policies as solvers: the shipped DAN, and the two that a trained policy must beat.
+"""Policies as solvers: the shipped networks, ScheduleNet, and the two that a trained policy must beat.
 
 They run on the CPU, as all other solvers do, so that times can be compared.
 """
 
 from __future__ import annotations
 
+from functools import cache
+
+from torch import nn
+
 from benchmarks.policies import nearest as policies
-from dan_policy import SolveOptions
+from benchmarks.solvers import WEIGHTS
+from dan_policy import SolveOptions, load
 from dan_policy import solve as solve_with
 from mtsp_env.instance import Instance, Tours
 
@@ -19,14 +24,30 @@ def dan(
     augment: bool = False,
     policy: str = "default",
 ) -> Tours:
-    """Tours by a shipped DAN, greedy or the best of ``samples`` (paper, Sec. 6); ``seconds`` is ignored.
+    """Tours by a shipped network, greedy or the best of ``samples`` (paper, Sec. 6); ``seconds`` is ignored.
 
     With ``augment`` the instance is solved in the eight symmetries of the square.
     """
+    return _plan(policy, instance, seed, samples, augment)
+
+
+def schedulenet(
+    instance: Instance, seconds: float, seed: int, samples: int | None = None, augment: bool = False
+) -> Tours:
+    """Tours by ScheduleNet (``benchmarks/policies/schedulenet.py``); arguments as in ``dan``."""
+    return _plan(_schedulenet(), instance, seed, samples, augment)
+
+
+def _plan(policy: str | nn.Module, instance: Instance, seed: int, samples: int | None, augment: bool) -> Tours:
     options = SolveOptions(augment=augment, seed=seed, device="cpu")
     if samples is None:
         return solve_with(instance, policy, options).tours
     return solve_with(instance, policy, options, decode="sample", samples=samples).tours
+
+
+@cache
+def _schedulenet() -> nn.Module:
+    return load(WEIGHTS / "schedulenet.safetensors", network="benchmarks.policies.schedulenet:ScheduleNet")
 
 
 def improved_dan(instance: Instance, seconds: float, seed: int, policy: str = "default") -> Tours:

@@ -19,7 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from mtsp_env.checks import check_count, check_seconds
-from mtsp_env.instance import Instance, Tours, check_arrays
+from mtsp_env.instance import Instance, Tours, check_arrays, check_plain
 from mtsp_env.machine import check_memory, usable_cores
 from mtsp_env.reference import sisr
 from mtsp_env.reference.search import as_order, as_tours, new_search, place_agents, remaining_order
@@ -69,9 +69,11 @@ def improve(
         One tour per agent, [0, ..., 0]; a copy of ``tours`` if the search has found nothing shorter.
 
     Raises:
-        ValueError: the tours do not solve the instance or do not begin with the prefixes, no tours that solve the
-            instance begin with the prefixes, a number is outside its range, or the search does not fit into the memory.
+        ValueError: the instance has world fields, the tours do not solve it or do not begin with the prefixes, no tours
+            that solve it begin with the prefixes, a number is outside its range, or the search does not fit into the
+            memory.
     """
+    check_plain(instance)
     if seconds is not None:
         check_seconds("seconds", seconds)
     _check_search(iterations, seed)

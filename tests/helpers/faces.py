@@ -5,8 +5,8 @@ To test another face against the oracle, add a class with the five methods of ``
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, fields
 from functools import cache, partial
 
 import numpy as np
@@ -19,6 +19,7 @@ from helpers.oracle import Oracle
 from mtsp_env import Instance, mtsp_v0, rules
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.instance import Problem
+from mtsp_env.tours import check_log
 
 # Games, and the players that choose the actions
 
@@ -27,11 +28,26 @@ from mtsp_env.instance import Problem
 class Game:
     """B games of one size under one set of rules; a row has its own nodes and its own player."""
 
-    nodes: np.ndarray  # (B, n, 2)
+    arrays: dict[str, np.ndarray]  # nodes (B, n, 2) and the fields of the world (B, ...)
     n_agents: int
     rules: rules.Rules
     players: tuple[Callable[[Oracle, np.random.Generator], int], ...]  # B
     seed: int
+
+    @property
+    def nodes(self) -> np.ndarray:
+        """(B, n, 2)."""
+        return self.arrays["nodes"]
+
+    @property
+    def world(self) -> dict[str, np.ndarray]:
+        """The fields of the world, by name."""
+        return {name: array for name, array in self.arrays.items() if name != "nodes"}
+
+    def oracle(self, row: int) -> Oracle:
+        """A fresh oracle for one row."""
+        world = {name: array[row] for name, array in self.world.items()}
+        return Oracle(self.nodes[row], self.n_agents, world=world, **asdict(self.rules))
 
 
 @dataclass(frozen=True)
@@ -44,6 +60,7 @@ class Moment:
     agents: np.ndarray  # (m, 3)
     visited: np.ndarray  # (n,)
     action_mask: np.ndarray  # (n,)
+    extra: dict[str, np.ndarray]  # the keys that only worlds, view and hearing have
 
 
 def pick_any(oracle: Oracle, rng: np.random.Generator) -> int:
@@ -74,6 +91,59 @@ PLACES: dict[str, Callable[[np.random.Generator, int], np.ndarray]] = {
 }
 
 
+FIELDS = ("speeds", "service", "appears", "breaks", "traffic")
+
+
+def random_world(
+    rng: np.random.Generator, batch: int, n: int, m: int, fields: Sequence[str], speed: float
+) -> dict[str, np.ndarray]:
+    """World fields with many ties: half of the times are whole numbers of ticks, some of one value for everybody."""
+
+    def times(shape: tuple[int, ...], most: float) -> np.ndarray:
+        drawn = rng.uniform(0.0, most, shape)
+        return np.where(rng.random(shape) < 0.5, np.round(drawn / speed) * speed, drawn)
+
+    length = float(rng.choice([0.3, 1.0, 3.0]))  # of the game in which something happens
+    breaks = np.where(rng.random((batch, m)) < rng.choice([0.3, 0.9]), times((batch, m), length) + speed / 3, np.inf)
+    breaks[np.arange(batch), rng.integers(0, m, batch)] = np.inf
+    if rng.random() < 0.5:  # all at once
+        breaks[np.isfinite(breaks)] = np.round(length / 3 / speed) * speed + speed
+    appears = times((batch, n), length) * (rng.random((batch, n)) < rng.choice([0.3, 0.6, 1.0]))
+    service = times((batch, n), 0.2) * (rng.random((batch, n)) < 0.7)
+    appears[:, 0] = service[:, 0] = 0.0
+    world = {
+        "speeds": rng.choice([0.5, 1.0, 1.0, 2.0, rng.uniform(0.5, 1.5)], (batch, m)),
+        "service": service,
+        "appears": appears,
+        "breaks": breaks,
+        "traffic": rng.choice([0.5, 1.0, 1.0, 2.0, rng.lognormal(0.0, 0.3)], (batch, m, int(rng.integers(1, 5)))),
+    }
+    return {name: world[name] for name in fields}
+
+
+def random_world_game(seed: int, batch: int = 4) -> Game:
+    """A game in a world of one field, of some or of all; every fourth has ``view`` or ``hearing``, or both."""
+    rng = np.random.default_rng([seed, 1])
+    n, m, speed = int(rng.integers(2, 16)), int(rng.integers(1, 7)), float(rng.choice([0.1, 0.01]))
+    number = (1, 1, 2, 3, 5)[seed % 5]
+    fields = (FIELDS[seed // 5 % 5],) if number == 1 else tuple(rng.permutation(FIELDS)[:number].tolist())
+    depots = ["open", "wait"] if {"appears", "breaks"} & set(fields) else list(rules.DEPOTS)
+    game_rules = rules.make_rules(
+        n,
+        m,
+        speed=speed,
+        depot=str(rng.choice(depots)),
+        reward=str(rng.choice(rules.REWARDS)),
+        max_decisions=None if rng.random() < 0.75 else int(rng.integers(1, 2 * (n + m))),
+        view=int(rng.integers(1, n)) if seed % 4 == 0 else None,
+        hearing=float(rng.choice([0.0, 0.2, 0.5])) if seed % 8 in (0, 1) else None,
+    )
+    kinds = rng.choice([*PLACES, "uniform", "uniform"], batch)
+    nodes = np.stack([PLACES[kind](rng, n) for kind in kinds])
+    players = tuple(PLAYERS[i] for i in rng.integers(0, len(PLAYERS), batch))
+    return Game({"nodes": nodes, **random_world(rng, batch, n, m, fields, speed)}, m, game_rules, players, seed)
+
+
 def random_game(seed: int, batch: int = 4) -> Game:
     rng = np.random.default_rng(seed)
     n, m = int(rng.integers(2, 61)), int(rng.integers(1, 13))
@@ -87,7 +157,7 @@ def random_game(seed: int, batch: int = 4) -> Game:
         max_decisions=None if rng.random() < 0.75 else int(rng.integers(1, n + m)),
     )
     players = tuple(PLAYERS[i] for i in rng.integers(0, len(PLAYERS), batch))
-    return Game(np.stack([PLACES[kind](rng, n) for kind in kinds]), m, game_rules, players, seed)
+    return Game({"nodes": np.stack([PLACES[kind](rng, n) for kind in kinds])}, m, game_rules, players, seed)
 
 
 @dataclass(frozen=True)
@@ -102,20 +172,15 @@ class Trace:
 
 def play(game: Game) -> list[Trace]:
     """Every row of the game, played by the oracle: the traces that all faces must reproduce."""
-    traces, game_rules = [], game.rules
+    traces = []
     for row, player in enumerate(game.players):
         rng = np.random.default_rng([game.seed, row])
-        oracle = Oracle(
-            game.nodes[row],
-            game.n_agents,
-            game_rules.speed,
-            game_rules.depot,
-            game_rules.reward,
-            game_rules.max_decisions,
-        )
+        oracle = game.oracle(row)
         trace = Trace([], [], [], oracle)
         while not oracle.done:
-            trace.moments.append(Moment(oracle.agent, oracle.tick, *map(np.array, oracle.observe())))
+            *seen, extra = oracle.observe()
+            extra = {key: np.array(value) for key, value in extra.items()}
+            trace.moments.append(Moment(oracle.agent, oracle.tick, *map(np.array, seen), extra))
             trace.actions.append(player(oracle, rng))
             oracle.step(trace.actions[-1])
             trace.rewards.append(oracle.reward)
@@ -124,13 +189,13 @@ def play(game: Game) -> list[Trace]:
 
 
 @cache
-def play_random(seed: int) -> tuple[Game, list[Trace]]:
-    """``random_game(seed)`` and its traces, played once for all faces."""
-    game = random_game(seed)
+def play_random(seed: int, make: Callable[[int], Game] = random_game) -> tuple[Game, list[Trace]]:
+    """``make(seed)`` and its traces, played once for all faces."""
+    game = make(seed)
     return game, play(game)
 
 
-# Faces: all implementations of the rules. A face is built from (nodes (B, n, 2), n_agents, rules) and has the five
+# Faces: all implementations of the rules. A face is built from a game and has the five
 # methods below; `step` is given an action for each row, 0 for rows that are over.
 
 
@@ -139,15 +204,16 @@ class RulesFace:
 
     reward_tolerance = 1e-9
 
-    def __init__(self, array: Callable, nodes: np.ndarray, n_agents: int, game_rules: rules.Rules):
-        self.array, self.game_rules = array, game_rules
-        self.state = rules.start(Problem(n_agents, {"nodes": array(nodes)}))
+    def __init__(self, array: Callable, game: Game):
+        self.array, self.game_rules = array, game.rules
+        problem = Problem(game.n_agents, {name: array(values) for name, values in game.arrays.items()})
+        self.state = rules.start(problem, game.rules)
         self.paid = None
 
     def moments(self) -> list[Moment]:
-        state, seen = self.state, rules.observe(self.state, self.game_rules)
-        *seen, agent = map(np.asarray, seen)
-        return [Moment(*row) for row in zip(agent, np.asarray(rules.now(state)), *seen, strict=True)]
+        seen = {key: np.asarray(value) for key, value in rules.observe(self.state, self.game_rules).arrays().items()}
+        seen["tick"] = np.asarray(rules.now(self.state))
+        return [_moment({key: value[row] for key, value in seen.items()}) for row in range(len(seen["tick"]))]
 
     def step(self, actions: list[int]) -> None:
         before, self.state = self.state, rules.depart(self.state, self.game_rules, self.array(actions))
@@ -158,14 +224,16 @@ class RulesFace:
 
     def over(self) -> list[tuple[bool, bool]]:
         """(terminated, truncated) of each row."""
-        ends = rules.all_visited(self.state), rules.truncated(self.state, self.game_rules)
+        ends = rules.terminated(self.state), rules.truncated(self.state, self.game_rules)
         return list(zip(*(end.tolist() for end in ends), strict=True))
 
     def outcomes(self) -> list[tuple[float, list[list[int]]]]:
         """(cost, closed tours) of each row."""
         cost = rules.final_cost(self.state, self.game_rules).tolist()
         visits, destination = np.asarray(self.state.visits), np.asarray(self.state.destination)
-        return list(zip(cost, map(rules.tours, visits, destination), strict=True))
+        alive = [None] * len(cost) if self.state.alive is None else np.asarray(self.state.alive)
+        tours = [rules.tours(*row[:2], True, row[2]) for row in zip(visits, destination, alive, strict=True)]
+        return list(zip(cost, tours, strict=True))
 
 
 class AECFace:
@@ -173,14 +241,13 @@ class AECFace:
 
     reward_tolerance = 1e-9
 
-    def __init__(self, nodes: np.ndarray, n_agents: int, game_rules: rules.Rules):
-        size = nodes.shape[1], n_agents
-        self.envs = [
-            mtsp_v0.raw_env(*size, game_rules.speed, game_rules.depot, game_rules.reward, game_rules.max_decisions)
-            for _ in nodes
-        ]
-        for env, row in zip(self.envs, nodes, strict=True):
-            env.reset(options={"instance": Instance(row, n_agents)})
+    def __init__(self, game: Game):
+        self.envs = []
+        for row in range(len(game.nodes)):
+            world = {name: array[row] for name, array in game.world.items()}
+            env = mtsp_v0.raw_env(game.nodes.shape[1], game.n_agents, scenario=always(world), **asdict(game.rules))
+            env.reset(options={"instance": Instance(game.nodes[row], game.n_agents, **world)})
+            self.envs.append(env)
 
     def moments(self) -> list[Moment]:
         return [self._moment(env) for env in self.envs]
@@ -188,8 +255,9 @@ class AECFace:
     @staticmethod
     def _moment(env: mtsp_v0.raw_env) -> Moment:
         seen, agent = env.last()[0], env.possible_agents.index(env.agent_selection)
-        assert seen["observation"].pop("agent") == agent
-        return Moment(agent, env.now, **seen["observation"], action_mask=seen["action_mask"])
+        assert seen["observation"]["agent"] == agent
+        assert env.observation_space(env.agent_selection).contains(seen)
+        return _moment({"tick": env.now, "action_mask": seen["action_mask"], **seen["observation"]})
 
     def step(self, actions: list[int]) -> None:
         for env, action in zip(self.envs, actions, strict=True):
@@ -204,6 +272,12 @@ class AECFace:
         return [(all(env.terminations.values()), all(env.truncations.values())) for env in self.envs]
 
     def outcomes(self) -> list[tuple[float, list[list[int]]]]:
+        for env in self.envs:
+            if all(env.terminations.values()):
+                for speed in (env.rules.speed, None):
+                    assert check_log(env.instance, env.log, speed) == pytest.approx(
+                        env.infos["agent_0"]["makespan"], abs=1e-9
+                    )
         infos = [env.infos[env.possible_agents[-1]] for env in self.envs]
         return [(info["makespan"], env.tours) for info, env in zip(infos, self.envs, strict=True)]
 
@@ -213,16 +287,18 @@ class BatchedFace:
 
     reward_tolerance = 1e-5  # float32
 
-    def __init__(self, nodes: np.ndarray, n_agents: int, game_rules: rules.Rules):
-        size = nodes.shape[1], n_agents, nodes.shape[:1]
-        self.env = BatchedMTSP(*size, game_rules.speed, game_rules.depot, game_rules.reward, game_rules.max_decisions)
-        given = TensorDict({"game": {"nodes": torch.tensor(nodes)}}, batch_size=nodes.shape[:1])
-        self.td = self.env.reset(given, set_state=True)
+    def __init__(self, game: Game):
+        batch, n = game.nodes.shape[:2]
+        world = {name: array[0] for name, array in game.world.items()}
+        self.env = BatchedMTSP(n, game.n_agents, [batch], scenario=always(world), **asdict(game.rules))
+        arrays = {name: torch.tensor(array) for name, array in game.arrays.items()}
+        self.td = self.env.reset(TensorDict({"game": arrays}, batch_size=[batch]), set_state=True)
 
     def moments(self) -> list[Moment]:
-        columns = [self.td["agent"], self.td["game", "ready"].amin(1)]
-        columns += [self.td[key] for key in ("cities", "agents", "visited", "action_mask")]
-        return [Moment(*row) for row in zip(*(column.numpy() for column in columns), strict=True)]
+        others = {"game", "action", "reward", "done", "terminated", "truncated"}
+        seen = {key: value.numpy() for key, value in self.td.items() if key not in others}
+        seen["tick"] = self.td["game", "ready"].amin(1).numpy()
+        return [_moment({key: value[row] for key, value in seen.items()}) for row in range(len(seen["tick"]))]
 
     def step(self, actions: list[int]) -> None:
         any_legal = self.td["action_mask"].to(torch.uint8).argmax(1)  # for rows that are over
@@ -240,6 +316,16 @@ class BatchedFace:
         return list(zip(self.env.makespan(self.td).tolist(), self.env.tours(self.td), strict=True))
 
 
+def always(world: dict[str, np.ndarray]) -> Callable:
+    """A scenario in which every instance has these fields."""
+    return lambda rng, batch, n_nodes, n_agents: {name: np.stack([a] * batch) for name, a in world.items()}
+
+
+def _moment(seen: dict) -> Moment:
+    named = {field.name: seen.pop(field.name) for field in fields(Moment) if field.name != "extra"}
+    return Moment(**named, extra=seen)
+
+
 FACES: dict[str, Callable] = {
     "numpy": partial(RulesFace, np.array),
     "torch": partial(RulesFace, torch.tensor),
@@ -250,7 +336,7 @@ FACES: dict[str, Callable] = {
 
 def check_face(name: str, game: Game, traces: list[Trace]) -> None:
     """Replay the oracle's actions on the face: every decision and every end must be the same."""
-    face = FACES[name](game.nodes, game.n_agents, game.rules)
+    face = FACES[name](game)
     last = [len(trace.actions) - 1 for trace in traces]
     for k in range(max(last) + 1):
         running = [row for row, end in enumerate(last) if k <= end]
@@ -276,3 +362,6 @@ def check_moment(seen: Moment, truth: Moment, where: str) -> None:
     assert seen.cities.shape == truth.cities.shape and np.abs(seen.cities - truth.cities).max() <= 1e-6, where
     assert not np.any(seen.agents[seen.agent]), where  # its own row: exactly zero
     assert seen.agents.shape == truth.agents.shape and np.abs(seen.agents - truth.agents).max() <= 1e-6, where
+    assert seen.extra.keys() == truth.extra.keys(), where
+    for key, value in truth.extra.items():
+        assert np.array_equal(seen.extra[key], value.astype(seen.extra[key].dtype)), f"{key}, {where}"
