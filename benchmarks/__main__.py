@@ -9,6 +9,9 @@ from typing import Any
 
 import tyro
 
+from dan_policy.arguments import open_streams
+from mtsp_env.reading import printable
+
 # Only the module of the chosen command is imported: some need packages that others do without
 COMMANDS = {
     "run": "benchmarks.harness.run:run",
@@ -34,6 +37,7 @@ def load(name: str) -> Callable[..., Any]:
 
 def main(argv: list[str] | None = None) -> int:
     """Run a command and print what it returns; exit code 2 and one line on bad input, 130 on Ctrl-C."""
+    open_streams()
     argv = sys.argv[1:] if argv is None else argv
     try:
         if argv and argv[0] in COMMANDS:
@@ -42,15 +46,24 @@ def main(argv: list[str] | None = None) -> int:
         else:
             commands = {name: load(name) for name in COMMANDS}
             result = tyro.extras.subcommand_cli_from_dict(commands, prog="python -m benchmarks", args=argv)
+        if result is not None:
+            print(result)
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader of our output, such as `head`, has closed it
+        return 1
     except (ValueError, OSError) as error:
-        print(f"benchmarks: error: {error}", file=sys.stderr)
-        return 2
+        return _refuse(str(error))
+    except MemoryError as error:
+        return _refuse(f"out of memory: {error}")
     except KeyboardInterrupt:
         print("benchmarks: interrupted; the same command resumes", file=sys.stderr)
         return 130
-    if result is not None:
-        print(result)
     return 0
+
+
+def _refuse(message: str) -> int:
+    print(f"benchmarks: error: {printable(' '.join(message.split()))}", file=sys.stderr)
+    return 2
 
 
 if __name__ == "__main__":

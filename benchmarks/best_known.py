@@ -14,14 +14,16 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 from rich.progress import track
 
 from benchmarks import suite
 from benchmarks.files import write_text
-from benchmarks.harness import rows
+from benchmarks.harness.judge import read_judged
 from benchmarks.harness.rows import Row
 from benchmarks.suite import AnyCell, Cell, PublicCell, TsplibCell
 from mtsp_env.instance import Instance, Tours
+from mtsp_env.reading import read_file
 from mtsp_env.tours import check_tours, lower_bound, makespan
 
 FOLDER = Path(__file__).parent / "best"
@@ -48,13 +50,15 @@ def read(cell: AnyCell, seed: int, folder: Path = FOLDER) -> dict[int, Tours]:
 def _read_file(file: Path) -> list[Tours | None]:
     if not file.exists():
         return []
+    content = read_file(file)
     try:
-        kept = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError as error:
+        kept = json.loads(content.decode("utf-8"))
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{file}: not JSON ({error})") from error
-    if not isinstance(kept, list):
-        raise ValueError(f"{file}: expected a list of tours, got {type(kept).__name__}")
-    return kept
+    try:
+        return msgspec.convert(kept, list[Tours | None])
+    except msgspec.ValidationError as error:
+        raise ValueError(f"{file}: expected a list of tours ({error})") from error
 
 
 def merge(cell: AnyCell, seed: int, candidates: Mapping[int, Tours], folder: Path = FOLDER) -> int:
@@ -174,8 +178,8 @@ def main(
         raise ValueError("choose at least one of --merge FILES, --search SECONDS and --check")
     if cells and table is None:
         raise ValueError(f"name the table of the cells {list(cells)} with --table")
-    for file in merge:
-        print("\n".join(merge_rows(rows.read(file), tsplib)))
+    if merge:
+        print("\n".join(merge_rows(read_judged(merge, tsplib), tsplib)))
     if search is None and not check:
         return
     if table is None:

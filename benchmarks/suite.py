@@ -11,11 +11,14 @@ import numpy as np
 from mtsp_env.checks import check_count
 from mtsp_env.distributions import sample
 from mtsp_env.instance import Instance, Tours
+from mtsp_env.machine import check_memory
 from mtsp_env.tsplib import read_tsplib
 
 SEED = 7  # of the test sets drawn here
 PUBLIC_SEED = 3333  # of the public test set
 PUBLIC_SIZE = 100  # instances of each n in the public test set
+MOST_INSTANCES = 10_000  # in a cell
+BYTES_PER_INSTANCE = 1000  # beside those of its coordinates
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,7 @@ class Cell(Size):
 
     def instances(self, seed: int, distribution: str = "uniform") -> list[Instance]:
         """Draw the cell's instances; the first k are the same for every ``count``."""
+        check_memory("instances", self.count, BYTES_PER_INSTANCE + 16 * self.n_nodes)
         rng = np.random.default_rng([seed, self.n_nodes, self.n_agents])
         return [
             sample(distribution, rng, 1, self.n_nodes, self.n_agents).instance(0, f"{self.label}-{i}")
@@ -204,6 +208,8 @@ def cells(table: str, tsplib: Path | None = None, count: int | None = None) -> t
     chosen = TABLES[table]
     if count is not None:
         check_count("instances", count, minimum=1)
+        if count > MOST_INSTANCES:
+            raise ValueError(f"instances must be at most {MOST_INSTANCES}, got {count}")
         if any(isinstance(cell, TsplibCell) for cell in chosen) and count != 1:
             raise ValueError(f"table {table} has 1 instance in each cell, got instances = {count}")
         chosen = tuple(replace(cell, count=count) for cell in chosen)

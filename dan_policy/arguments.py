@@ -9,6 +9,7 @@ import functools
 import io
 import itertools
 import math
+import os
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr
@@ -21,7 +22,9 @@ except ImportError as missing:
 from tyro.conf import Positional, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
-__all__ = ["SECONDS", "Positional", "arg", "default", "parse", "refuse", "whole"]
+from mtsp_env.reading import printable
+
+__all__ = ["SECONDS", "Positional", "arg", "default", "open_streams", "parse", "refuse", "whole"]
 
 Command = Callable[..., None]
 
@@ -45,15 +48,25 @@ def parse(commands: Sequence[Command], description: str, argv: Sequence[str]) ->
         refuse(_without_box(report.getvalue()))
 
 
+def open_streams() -> None:
+    """Let what is printed vanish if the process was started without a standard output or error (``>&-``)."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115 (open until the process ends)
+
+
 def refuse(message: str) -> NoReturn:
     """Exit with 2 and ``message`` as one line on stderr."""
-    sys.stderr.write(f"mtsp: error: {' '.join(message.split())}\n")
+    sys.stderr.write(f"mtsp: error: {printable(' '.join(message.split()))}\n")
     sys.exit(2)
 
 
-def whole(minimum: int, metavar: str) -> Any:
-    """An annotation for a whole number from ``minimum`` to 2^63 - 1."""
-    return _number(int, lambda value: minimum <= value < 2**63, f"a whole number of at least {minimum}", metavar)
+def whole(minimum: int, metavar: str, maximum: int = 2**63 - 1) -> Any:
+    """An annotation for a whole number from ``minimum`` to ``maximum``."""
+    expected = f"a whole number of at least {minimum}"
+    if maximum < 2**63 - 1:
+        expected = f"a whole number from {minimum} to {maximum}"
+    return _number(int, lambda value: minimum <= value <= maximum, expected, metavar)
 
 
 def default(text: str) -> Any:

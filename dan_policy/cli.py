@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 import re
 import sys
 import time
@@ -18,17 +19,21 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from dan_policy.arguments import SECONDS, Positional, arg, default, parse, refuse, whole
+from dan_policy.arguments import SECONDS, Positional, arg, default, open_streams, parse, refuse, whole
 from dan_policy.serve import serve
 from mtsp_env import render
 from mtsp_env.distributions import sample
 from mtsp_env.files import read_instance, write_instance, write_tours
 from mtsp_env.instance import Instance, Tours
+from mtsp_env.machine import check_memory
+from mtsp_env.reading import printable
 from mtsp_env.tours import lower_bound, tour_lengths
 from mtsp_env.tsplib import read_tsplib
 from mtsp_env.version import __version__
 
 DEFAULT_SAMPLES = 64  # the paper's DAN(s.64)
+MOST_AGENTS = 100_000  # agents beyond the number of cities stay at home anyway
+BYTES_PER_NODE = 500  # of a generated instance, as lists and text
 DESCRIPTION = """\
 The MinMax multiple travelling salesman problem: plan one tour per agent, from the depot and back, so that together they
 visit all cities and the longest tour is as short as possible.
@@ -41,6 +46,7 @@ examples:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command and return 0. Bad input exits with 2 and one line on stderr; Ctrl-C returns 130, silently."""
+    open_streams()
     argv = list(sys.argv[1:] if argv is None else argv)
     if argv == ["--version"]:
         print(f"mtsp {__version__}")
@@ -57,6 +63,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         refuse(f"{error.filename}: {error.strerror}" if error.filename and error.strerror else str(error))
     except (ValueError, ImportError) as error:
         refuse(str(error))
+    except MemoryError as error:
+        refuse(f"out of memory: {error}")
     return 0
 
 
@@ -77,7 +85,7 @@ Solver = Callable[[Instance], Plan]
 
 def solve(
     files: Annotated[Positional[tuple[str, ...]], arg(metavar="FILE", help_behavior_hint="(at least one)")],
-    agents: Annotated[int | None, whole(1, "M"), default("as the file says")] = None,
+    agents: Annotated[int | None, whole(1, "M", MOST_AGENTS), default("as the file says")] = None,
     seed: Annotated[int, whole(0, "S")] = 0,
     method: Literal["dan", "reference"] = "dan",
     seconds: Annotated[float | None, SECONDS, default("500 n iterations")] = None,
@@ -249,7 +257,10 @@ def _table() -> Callable[[dict[str, Any]], None]:
 def _read(path: Path, n_agents: int | None) -> Instance:
     suffix = path.suffix.lower()
     if suffix == ".json":
-        return read_instance(path, n_agents)
+        instance = read_instance(path, n_agents)
+        if instance.n_agents > MOST_AGENTS:
+            raise ValueError(f"{path}: n_agents must be at most {MOST_AGENTS}, got {instance.n_agents}")
+        return instance
     if suffix != ".tsp":
         raise ValueError(f"{path}: unknown suffix {path.suffix!r}; choose from ['.json', '.tsp']")
     if n_agents is None:
@@ -273,13 +284,13 @@ def _outputs(path: str | None, instances: Sequence[Instance]) -> list[Path | Non
 
 
 def _check_outputs(files: Sequence[str], outputs: Mapping[str, Sequence[Path | None]]) -> None:
-    taken = {Path(file).resolve() for file in files}
+    taken = {os.path.realpath(file) for file in files}  # unlike Path.resolve, it raises no error in a loop of links
     for path in filter(None, itertools.chain(*outputs.values())):
         if not path.parent.is_dir():
             raise ValueError(f"{path}: no such folder")
-        if path.resolve() in taken:
+        if os.path.realpath(path) in taken:
             raise ValueError(f"{path}: would overwrite another file of this command")
-        taken.add(path.resolve())
+        taken.add(os.path.realpath(path))
     for plot in filter(None, outputs["plot"]):
         render.check_suffix(plot)
     for animation in filter(None, outputs["animate"]):
@@ -311,7 +322,7 @@ def _record(instance: Instance, plan: Plan) -> dict[str, Any]:
 def generate(
     out: Annotated[Positional[str], arg(metavar="OUT.json")],
     nodes: Annotated[int, whole(2, "N")],
-    agents: Annotated[int, whole(1, "M")],
+    agents: Annotated[int, whole(1, "M", MOST_AGENTS)],
     seed: Annotated[int, whole(0, "S")] = 0,
     distribution: str = "uniform",
 ) -> None:
@@ -330,6 +341,7 @@ def generate(
     path = Path(out)
     if path.suffix.lower() != ".json":
         raise ValueError(f"{path}: unknown suffix {path.suffix!r}; choose from ['.json']")
+    check_memory("nodes", nodes, BYTES_PER_NODE)
     problem = sample(distribution, np.random.default_rng(seed), 1, nodes, agents)
     with _writing(path):
         write_instance(path, problem.instance(0, f"{distribution}-{nodes}-{seed}"))
@@ -342,7 +354,7 @@ def _writing(path: Path, quiet: bool = False) -> Iterator[None]:
     except OSError as error:
         raise ValueError(f"{path}: cannot write it ({error.strerror or error})") from error
     if not quiet:
-        print(f"wrote {path}")
+        print(f"wrote {printable(str(path))}")
 
 
 if __name__ == "__main__":

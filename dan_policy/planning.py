@@ -25,9 +25,12 @@ from dan_policy.symmetry import SYMMETRIES
 from mtsp_env import rules
 from mtsp_env.checks import check_count, check_seconds
 from mtsp_env.instance import Instance, Tours, check_plain
+from mtsp_env.machine import check_memory
 from mtsp_env.tours import check_prefixes, check_tours, makespan
 
 Precision = Literal["auto", "float32", "bfloat16"]
+BYTES_PER_AGENT = 200  # of its tour as a list
+BYTES_PER_GAME_AND_NODE = 100  # of the state of a game, for each of its nodes and agents; networks need far more
 SPEED = 0.01  # distance per tick (the paper's Delta g in tests, Sec. 6)
 
 
@@ -137,12 +140,15 @@ def solve(
         ImportError: ``improve`` without Numba.
         OSError: no such weights.
         TypeError: an option that does not exist.
-        ValueError: an instance with world fields, bad weights, an option outside its range, or one that the policy
-            does not have.
+        ValueError: an instance with world fields, bad weights, an option outside its range, one that the policy does
+            not have, or games that do not fit into the memory.
     """
     check_plain(instance)
     options = replace(options or SolveOptions(), **changes)
+    check_memory("n_agents", instance.n_agents, BYTES_PER_AGENT)
     begun = [] if prefixes is None else check_prefixes(instance, prefixes)
+    team = instance if begun else without_spare_agents(instance)
+    check_memory("samples", options.games, BYTES_PER_GAME_AND_NODE * (instance.n_nodes + team.n_agents))
     improve = _improvement(options, begun)
     device = find_device(options.device)
     named = isinstance(policy, (str, os.PathLike))  # a network that is nobody else's
@@ -151,15 +157,23 @@ def solve(
     generator = torch.Generator(device).manual_seed(options.seed) if options.decode == "sample" else None
 
     start = time.perf_counter()
-    game = rules.make_rules(instance.n_nodes, instance.n_agents, SPEED, "final", "sparse", None)
-    state = begin(instance, game, begun, options.games, options.augment, device)
+    game = rules.make_rules(instance.n_nodes, team.n_agents, SPEED, "final", "sparse", None)
+    state = begin(team, game, begun, options.games, options.augment, device)
     with torch.inference_mode(named), _autocast(policy, options, instance.n_nodes, device):
         tours = best_tours(play(policy, state, game, generator))
-    tours = improve(instance, tours)
+    tours = improve(instance, tours + [[0, 0] for _ in range(instance.n_agents - team.n_agents)])
     seconds = time.perf_counter() - start
 
     check_tours(instance, tours)
     return Solution(tours, makespan(instance, tours), seconds, f"{name}{_decoding(options)}")
+
+
+def without_spare_agents(instance: Instance) -> Instance:
+    """A plain instance with at most one agent per city; others would never leave by the rule "final".
+
+    All agents decide at the start, in their order, and each of them picks a city while there are any.
+    """
+    return replace(instance, n_agents=min(instance.n_agents, instance.n_nodes - 1))
 
 
 def _improvement(options: SolveOptions, prefixes: Tours) -> Callable[[Instance, Tours], Tours]:

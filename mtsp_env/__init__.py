@@ -42,7 +42,7 @@ def _register() -> None:
     gymnasium.register("mtsp/MinMaxMTSP-v0", entry_point="mtsp_env.single:MinMaxMTSP")
     try:
         from pettingzoo import register
-    except ImportError:
+    except (ImportError, FileNotFoundError):  # it cannot be imported in a working directory that is gone
         return
     register("aec", "mtsp/mtsp-v0", entry_point="mtsp_env.mtsp_v0:env")
 

@@ -6,10 +6,10 @@ import json
 import math
 import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from mtsp_env.instance import FIELDS, Instance, Tours
+from mtsp_env.reading import read_file
 from mtsp_env.writing import atomic_write
 
 
@@ -24,10 +24,11 @@ def read_json(path: str | os.PathLike, keys: Sequence[str]) -> dict:
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: the file is no JSON object with these keys.
+        ValueError: the file is no JSON object with these keys, or not a regular file.
     """
+    content = read_file(path)
     try:
-        data = json.loads(Path(path).read_text(encoding="utf-8"))
+        data = json.loads(content.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:  # not JSON, not text, or nested deeper than Python can read
         raise ValueError(f"{path}: not a JSON file ({error})") from error
     if not isinstance(data, dict) or not set(keys) <= data.keys():

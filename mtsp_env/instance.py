@@ -14,6 +14,7 @@ speed 1.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -112,11 +113,11 @@ class Instance:
         check_count("n_agents", self.n_agents, minimum=1)
         if not isinstance(self.name, str):
             raise ValueError(f"name must be a string, got {self.name!r}")
-        scale = _check_scale(self.scale)
         arrays = {name: _read_only_copy(name, value) for name, value in self.arrays().items()}
         if arrays["nodes"].ndim != 2:
             raise ValueError(f"nodes must have shape (n, 2), got {arrays['nodes'].shape}")
         check_arrays(arrays, self.n_agents)
+        scale = _check_scale(self.scale, len(arrays["nodes"]))
         for name, value in {"n_agents": int(self.n_agents), "scale": scale, **arrays}.items():
             object.__setattr__(self, name, value)
 
@@ -296,7 +297,7 @@ def from_coordinates(xy: np.ndarray | Sequence, n_agents: int, name: str = "") -
     """Bring any planar coordinates (n, 2) to the unit square; ``scale`` keeps their units.
 
     Raises:
-        ValueError: fewer than two points, not of shape (n, 2), or not finite.
+        ValueError: fewer than two points, not of shape (n, 2), not finite, or so far apart that lengths overflow.
     """
     xy = _as_numbers("coordinates", xy)
     if xy.ndim != 2 or xy.shape[1] != 2:
@@ -305,7 +306,10 @@ def from_coordinates(xy: np.ndarray | Sequence, n_agents: int, name: str = "") -
     if not np.isfinite(xy).all():
         raise ValueError("coordinates must be finite")
     corner = xy.min(axis=0)
-    extent = float((xy.max(axis=0) - corner).max()) or 1.0  # all nodes in one place: nothing to scale
+    with np.errstate(over="ignore"):
+        extent = float((xy.max(axis=0) - corner).max()) or 1.0  # all nodes in one place: nothing to scale
+    if not extent <= _largest_scale(len(xy)):
+        raise ValueError(f"coordinates must span at most {_largest_scale(len(xy)):g}, got {extent:g}")
     return Instance(np.clip((xy - corner) / extent, 0.0, 1.0), n_agents, name, extent)
 
 
@@ -317,16 +321,29 @@ def _read_only_copy(name: str, values: object) -> np.ndarray:
 
 def _as_numbers(name: str, values: object) -> np.ndarray:
     try:
+        if isinstance(values, (list, tuple)):  # NumPy would read "1" and True as 1.0
+            kinds = set(map(type, np.asarray(values, dtype=object).ravel()))
+            if unwanted := kinds & {bool, np.bool_, str, np.str_, bytes}:
+                raise ValueError(f"a {unwanted.pop().__name__} in it")
+        elif np.asarray(values).dtype.kind not in "iuf":
+            raise ValueError(f"its dtype is {np.asarray(values).dtype}")
         return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{name} must be an array of numbers, got {type(values).__name__}: {error}") from error
 
 
-def _check_scale(scale: Any) -> float:
+def _largest_scale(n_nodes: int) -> float:
+    """The scale up to which lengths are finite: no tour of n nodes is longer than 2 n sides of the unit square."""
+    return sys.float_info.max / (2 * n_nodes)
+
+
+def _check_scale(scale: Any, n_nodes: int) -> float:
     try:
-        value = float(scale)
+        value = math.nan if isinstance(scale, (str, bool)) else float(scale)
     except (TypeError, ValueError, OverflowError):
         value = math.nan
-    if isinstance(scale, str) or not (math.isfinite(value) and value > 0):
+    if not (math.isfinite(value) and value > 0):
         raise ValueError(f"scale must be a finite number above 0, got {scale!r}")
+    if value > _largest_scale(n_nodes):
+        raise ValueError(f"scale must be at most {_largest_scale(n_nodes):g}, got {value:g}: lengths would overflow")
     return value

@@ -6,13 +6,15 @@ A solver's own cost is never trusted.
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mtsp_env.instance import Instance, Tours, check_plain
+from mtsp_env.spanning_tree import spanning_tree_length
 
 TOLERANCE = 1e-6  # of the times in a log
 
@@ -91,9 +93,8 @@ def check_tours(instance: Instance, tours: Sequence[Sequence[int]]) -> None:
     """
     if len(tours) != instance.n_agents:
         raise ValueError(f"expected {instance.n_agents} tours, one per agent, got {len(tours)}")
-    count = np.zeros(instance.n_nodes, dtype=np.int64)
-    for agent, tour in enumerate(tours):
-        path = np.asarray(tour)
+    paths = [np.asarray(tour) for tour in tours]
+    for agent, path in enumerate(paths):
         if path.ndim != 1 or not np.issubdtype(path.dtype, np.integer) or len(path) < 2:
             raise ValueError(f"tour {agent} must be a list of at least 2 node numbers, got {path.tolist()}")
         outside = path[(path < 0) | (path >= instance.n_nodes)]
@@ -101,7 +102,7 @@ def check_tours(instance: Instance, tours: Sequence[Sequence[int]]) -> None:
             raise ValueError(f"tour {agent} visits node {outside[0]}, outside 0..{instance.n_nodes - 1}")
         if path[0] != 0 or path[-1] != 0:
             raise ValueError(f"tour {agent} must begin and end at the depot 0, got {path[0]} and {path[-1]}")
-        count += np.bincount(path, minlength=instance.n_nodes)
+    count = np.bincount(np.concatenate(paths).astype(np.int64), minlength=instance.n_nodes)
     missing = np.flatnonzero(count[1:] == 0) + 1
     if len(missing):
         raise ValueError(f"{_cities(missing)} missing from the tours")
@@ -121,7 +122,7 @@ def check_prefixes(instance: Instance, prefixes: Sequence[Sequence[int]]) -> Tou
     """
     if len(prefixes) != instance.n_agents:
         raise ValueError(f"expected {instance.n_agents} prefixes, one per agent, got {len(prefixes)}")
-    lists = [[int(node) for node in prefix] for prefix in prefixes]
+    lists = [[_node_number(agent, node) for node in prefix] for agent, prefix in enumerate(prefixes)]
     seen: set[int] = set()
     for agent, prefix in enumerate(lists):
         if not prefix or prefix[0] != 0:
@@ -137,6 +138,16 @@ def check_prefixes(instance: Instance, prefixes: Sequence[Sequence[int]]) -> Tou
     if len(seen) < instance.n_nodes and all(map(is_closed, lists)):
         raise ValueError(f"all agents are home for good, and {instance.n_nodes - len(seen)} cities are left")
     return lists
+
+
+def _node_number(agent: int, node: Any) -> int:
+    try:
+        number = operator.index(node)
+    except TypeError:
+        number = None
+    if number is None or isinstance(node, (bool, np.bool_)):
+        raise ValueError(f"prefix {agent} must be a list of node numbers, got {node!r} in it")
+    return number
 
 
 def is_closed(prefix: Sequence[int]) -> bool:
@@ -158,24 +169,14 @@ def farthest_trip(nodes: np.ndarray) -> float:
 def lower_bound(instance: Instance) -> float:
     """A lower bound on the makespan: the larger of ``farthest_trip`` and the minimum spanning tree's length over m.
 
-    The m tours together contain a spanning tree of all nodes, so the longest is at least the tree's length over m.
-    O(n^2) time, O(n) memory (Prim's algorithm).
+    The m tours together contain a spanning tree of all nodes, so the longest is at least the tree's length over m. For
+    time and memory see ``spanning_tree_length``.
 
     Raises:
         ValueError: the instance is not plain.
     """
     check_plain(instance)
-    nodes = instance.nodes
-    distance = np.linalg.norm(nodes - nodes[0], axis=1)  # (n,) from each node to the tree grown so far
-    outside = np.ones(len(nodes), dtype=bool)
-    outside[0] = False
-    tree = 0.0
-    for _ in range(len(nodes) - 1):
-        nearest = int(np.argmin(np.where(outside, distance, np.inf)))
-        tree += float(distance[nearest])
-        outside[nearest] = False
-        distance = np.minimum(distance, np.linalg.norm(nodes - nodes[nearest], axis=1))
-    return max(farthest_trip(nodes), tree / instance.n_agents)
+    return max(farthest_trip(instance.nodes), spanning_tree_length(instance.nodes) / instance.n_agents)
 
 
 # Logs

@@ -15,6 +15,7 @@ import numpy as np
 
 from mtsp_env.checks import check_count
 from mtsp_env.instance import Instance, from_coordinates
+from mtsp_env.reading import read_file
 
 EARTH_RADIUS = 6378.388  # km, as in TSPLIB 95
 EDGE_WEIGHT_TYPES = ("EUC_2D", "CEIL_2D", "ATT", "GEO")
@@ -42,9 +43,7 @@ def read_tsplib(path: str | os.PathLike, n_agents: int) -> Instance:
     """
     check_count("n_agents", n_agents, minimum=1)
     path = Path(path)
-    if path.is_dir():
-        raise ValueError(f"{path}: a directory, not a TSPLIB file")
-    fields = _parse(path.read_bytes().decode("utf-8", errors="replace"), path)  # old files have Latin-1 comments
+    fields = _parse(read_file(path).decode("utf-8-sig", errors="replace"), path)  # old files have Latin-1 comments
     try:
         kind = _check_fields(fields)
         name = str(fields.get("name", "")).strip() or path.stem

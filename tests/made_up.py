@@ -20,6 +20,7 @@ def row(instance: Instance, tours: Tours, number: int, cell: str = "8x2", table:
         "table": table,
         "cell": cell,
         "instance": number,
+        "name": instance.name,
         "seed": 7,
         "status": "ok",
         "method": "deals",

@@ -216,8 +216,8 @@ def test_it_says_where_the_files_are(folder, solver, capsys) -> None:
         ("junk.tsp --agents 2", "junk.tsp: not a TSPLIB file"),
         ("junk.json", "junk.json: not a JSON file"),
         ("square.json nowhere.json", "nowhere.json: No such file"),
-        ("square.json --agents 0", "--agents: must be a whole number of at least 1, got '0'"),
-        ("square.json --agents two", "--agents: must be a whole number of at least 1, got 'two'"),
+        ("square.json --agents 0", "--agents: must be a whole number from 1 to 100000, got '0'"),
+        ("square.json --agents two", "--agents: must be a whole number from 1 to 100000, got 'two'"),
         ("square.json --agents 2.5", "got '2.5'"),
         ("square.json --decode sample --samples -3", "--samples: must be a whole number of at least 1, got '-3'"),
         ("square.json --samples 3", "--samples needs --decode sample"),
@@ -324,7 +324,7 @@ def test_generate_defaults_are_the_papers(folder) -> None:
     ("argv", "message"),
     [
         ("--nodes 1 --agents 2 a.json", "--nodes: must be a whole number of at least 2, got '1'"),
-        ("--nodes 5 --agents 0 a.json", "--agents: must be a whole number of at least 1, got '0'"),
+        ("--nodes 5 --agents 0 a.json", "--agents: must be a whole number from 1 to 100000, got '0'"),
         ("--nodes 5 --agents 2 --seed -1 a.json", "--seed: must be a whole number of at least 0"),
         (
             "--nodes 5 --agents 2 --distribution ring a.json",

@@ -40,7 +40,7 @@ FORBIDDEN = {
     "dan_policy/actor.py": ["mtsp_env*"],
     "benchmarks/peers/rl4co_speed.py": ["mtsp_env*", "dan_policy*", "train*", "benchmarks*"],
 }
-NEEDS_AN_EXTRA = {"torch", "tensordict", "torchrl", "numba", "matplotlib", "vrplib"}
+NEEDS_AN_EXTRA = {"torch", "tensordict", "torchrl", "numba", "scipy", "matplotlib", "vrplib"}
 LIGHT = [
     "__init__",
     "__main__",
@@ -57,6 +57,7 @@ LIGHT = [
     "rules",
     "schedule",
     "single",
+    "spanning_tree",
     "state",
     "tours",
     "tsplib",

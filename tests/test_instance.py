@@ -35,7 +35,7 @@ instances = st.builds(
     nodes=st.integers(2, 6).flatmap(lambda n: arrays(np.float64, (n, 2), elements=st.floats(0, 1))),
     n_agents=st.integers(1, 9),
     name=st.text(),
-    scale=st.floats(min_value=0, exclude_min=True, allow_infinity=False),
+    scale=st.floats(min_value=0, exclude_min=True, max_value=1e300),
 )
 
 

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mtsp_env import Instance, check_tours, clustered, lower_bound, makespan, tour_lengths, uniform
+from mtsp_env import Instance, check_tours, clustered, lower_bound, machine, makespan, tour_lengths, uniform
 from mtsp_env.instance import Tours
 from mtsp_env.tours import path_lengths
 
@@ -132,6 +132,49 @@ def test_without_iterations_the_result_is_greedy_insertion() -> None:
         instance = random_instance(seed, n_nodes, n_agents)
         tours, expected = improve(instance, iterations=0), greedy_insertion(instance)
         assert [min(tour, tour[::-1]) for tour in tours] == [min(tour, tour[::-1]) for tour in expected]
+
+
+def test_greedy_insertion_next_to_near_cities_is_nearly_as_short_as_anywhere() -> None:
+    """n = 120: a city goes next to one of its 40 nearest or to the depot, not next to any other city."""
+    ratios = []
+    for seed in range(10):
+        instance = random_instance(seed, 120, 4)
+        everywhere = makespan(instance, greedy_insertion(instance))
+        ratios.append(makespan(instance, improve(instance, iterations=0)) / everywhere)
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.02)
+
+
+# Limits
+
+
+def test_large_instances_are_prepared_without_trying_all_pairs(monkeypatch) -> None:
+    """Trying all pairs of 20,000 nodes takes seconds."""
+    monkeypatch.setattr(sisr, "nearest_cities", lambda *_: pytest.fail("tried all pairs"))
+    instance = random_instance(0, 20_000, 10)
+    solver.compile_kernels()
+    tours = improve(instance, iterations=100)
+    check_tours(instance, tours)
+    assert makespan(instance, tours) < 1.9 * lower_bound(instance)  # near-optimal tours: about 1.1 times
+
+
+@pytest.mark.parametrize(
+    ("n_nodes", "n_agents", "message"),
+    [
+        (70_000, 2, "n_nodes 70000 needs about 0.13 GiB of memory, of which 0.125 GiB are free; at most 67108 fits"),
+        (
+            3,
+            700_000,
+            "n_agents 700000 needs about 0.13 GiB of memory, of which 0.125 GiB are free; at most 671088 fits",
+        ),
+    ],
+)
+def test_what_does_not_fit_into_the_memory_is_refused(monkeypatch, n_nodes: int, n_agents: int, message: str) -> None:
+    monkeypatch.setattr(machine, "available_memory", lambda: 2**27)
+    nodes = np.random.default_rng(0).random((1, n_nodes, 2))
+    with pytest.raises(ValueError, match=message):
+        improve(Instance(nodes[0], n_agents), iterations=0)
+    with pytest.raises(ValueError, match=message):
+        improve_batch(nodes, n_agents, iterations=0)
 
 
 # Any instance
@@ -273,15 +316,22 @@ def test_empty_float32_and_strided_batches() -> None:
 # Kernels
 
 
-@pytest.mark.parametrize(("n", "k"), [(2, 0), (3, 1), (40, 20), (40, 38)])
-def test_nearest_cities(n: int, k: int) -> None:
+@pytest.mark.parametrize(("n", "k"), [(2, 0), (3, 1), (40, 20), (40, 38), (299, 40), (300, 40), (700, 1)])
+@pytest.mark.parametrize("coincide", [False, True])
+def test_nearest_cities(n: int, k: int, coincide: bool) -> None:
+    """From 300 nodes on a k-d tree finds them. Of equally near cities any may be listed."""
     nodes = np.random.default_rng(n).random((n, 2))
-    near, distance = sisr.nearest_cities(nodes[:, 0].copy(), nodes[:, 1].copy(), n, k)
+    if coincide:
+        nodes = nodes[np.random.default_rng(0).integers(0, min(n, 4), n)]  # many in one place
+    near, distance = search_arrays.nearest_cities(nodes[:, 0].copy(), nodes[:, 1].copy(), k)
     assert near.shape == distance.shape == (n, k)
     for city in range(1, n):
         others = sorted((math.dist(nodes[city], nodes[other]), other) for other in range(1, n) if other != city)[:k]
-        assert near[city].tolist() == [other for _, other in others]
-        assert distance[city] == pytest.approx([length for length, _ in others])
+        assert len({0, city, *near[city].tolist()}) == k + 2  # other cities, each once
+        assert distance[city] == pytest.approx([length for length, _ in others], abs=1e-12)
+        assert distance[city] == pytest.approx(np.linalg.norm(nodes[near[city]] - nodes[city], axis=1), abs=1e-12)
+        if not coincide:
+            assert near[city].tolist() == [other for _, other in others]
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.5])
@@ -383,7 +433,8 @@ def test_bad_batches_are_named(nodes: np.ndarray, arguments: dict, message: str)
         improve_batch(nodes, **{"n_agents": 2, **arguments})
 
 
-def test_without_numba_the_extra_is_named() -> None:
-    code = "import sys; sys.modules['numba'] = None\nimport mtsp_env, mtsp_env.reference"
+@pytest.mark.parametrize("package", ["numba", "scipy"])
+def test_without_a_package_the_extra_is_named(package: str) -> None:
+    code = f"import sys; sys.modules['{package}'] = None\nimport mtsp_env, mtsp_env.reference"
     run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert "pip install 'mtsp-env[reference]'" in run.stderr
+    assert f"mtsp_env.reference needs {package}: pip install 'mtsp-env[reference]'" in run.stderr

@@ -189,10 +189,10 @@ def test_the_later_row_counts(tmp_path):
     [
         (lambda line: line[:50], "not JSON"),
         (lambda line: b"", "not JSON"),
-        (lambda line: b"\xff\xfe", "codec can't decode"),
+        (lambda line: b"\xff\xfe", "not JSON"),
         (lambda line: b"[1]", "expected an object with the fields"),
         (lambda line: line.replace(b'"seconds": 1.0', b'"minutes": 1.0'), "expected an object with the fields"),
-        (lambda line: line.replace(b'"ok"', b'"fine"'), "status must be one of"),
+        (lambda line: line.replace(b'"ok"', b'"fine"'), "Invalid enum value 'fine' - at `$.status`"),
         (lambda line: line.replace(b'"seconds": 1.0', b'"seconds": null'), "seconds"),
         (lambda line: line.replace(b"[0, 4, 5", b"[0, 5"), "city 4 missing"),
         (lambda line: line.replace(b'"makespan": ', b'"makespan": 1'), "that of its tours"),

@@ -209,7 +209,7 @@ def test_damaged_files_raise_no_other_error(tmp_path_factory, junk: bytes, where
 def test_a_missing_file_a_directory_and_no_agents_are_refused(tmp_path) -> None:
     with pytest.raises(OSError, match="nowhere"):
         read_tsplib(tmp_path / "nowhere.tsp", 2)
-    with pytest.raises(ValueError, match="a directory, not a TSPLIB file"):
+    with pytest.raises(ValueError, match="a directory, not a file"):
         read_tsplib(tmp_path, 2)
     with pytest.raises(ValueError, match="n_agents must be a whole number of at least 1, got 0"):
         read_tsplib(ROOT / "examples" / "europe.tsp", 0)

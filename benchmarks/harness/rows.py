@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import gzip
-import json
+import math
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
+import msgspec
+from msgspec import Meta
+
+from benchmarks.suite import MOST_INSTANCES
 from mtsp_env.instance import Tours
+from mtsp_env.reading import read_file
 
-STATUSES = ("ok", "unavailable", "no tours", "wrong tours", "error", "crash", "timeout")
+Status = Literal["ok", "unavailable", "no tours", "wrong tours", "error", "crash", "timeout"]
+Seconds = Annotated[float, Meta(ge=0)]
+Length = Annotated[float, Meta(ge=0)]
 
 
 @dataclass(frozen=True)
 class Row:
-    """The result of one solver on one instance.
+    """The result of one solver on one instance. ``parse`` reads it, and checks it against these annotations.
 
     Attributes:
         table: key of ``suite.TABLES``.
@@ -26,7 +34,7 @@ class Row:
         method: name of the solver.
         budget: seconds that the solver was given; None if it takes no budget.
         seed: seed of the test set; the solver's own seed is this plus ``instance``.
-        status: one of STATUSES.
+        status: what became of the run.
         error: the reason for any status but "ok", else None.
         makespan: makespan by ``mtsp_env.tours``, in lengths of the unit square; None without valid tours.
         bound: lower bound on the makespan, if the solver gives one.
@@ -41,19 +49,19 @@ class Row:
 
     table: str
     cell: str
-    instance: int
+    instance: Annotated[int, Meta(ge=0, lt=MOST_INSTANCES)]
     name: str
     method: str
-    budget: float | None
-    seed: int
-    status: str
+    budget: Annotated[float, Meta(gt=0)] | None
+    seed: Annotated[int, Meta(ge=0)]
+    status: Status
     error: str | None
-    makespan: float | None
+    makespan: Length | None
     bound: float | None
-    length: float | None
-    rounded_length: int | None
-    seconds: float
-    cpu_seconds: float | None
+    length: Length | None
+    rounded_length: Annotated[int, Meta(ge=0)] | None
+    seconds: Seconds
+    cpu_seconds: Seconds | None
     tours: Tours | None
     versions: dict[str, str]
     machine: dict[str, Any]
@@ -74,23 +82,25 @@ class Row:
         return self.method if self.budget is None else f"{self.method} {self.budget:g} s"
 
 
-def parse(line: str) -> Row:
+FIELDS = tuple(field.name for field in fields(Row))
+
+
+def parse(line: str | bytes) -> Row:
     """Parse one line. Raises ValueError if it is not a row."""
     try:
-        data = json.loads(line)
-    except ValueError as error:
+        data = msgspec.json.decode(line)
+        if not isinstance(data, dict) or data.keys() != set(FIELDS):
+            raise ValueError(f"expected an object with the fields {list(FIELDS)}")
+        row = msgspec.convert(data, Row)
+    except msgspec.ValidationError as error:  # its message names the field
+        raise ValueError(f"not a row ({error})") from error
+    except (msgspec.DecodeError, RecursionError) as error:
         raise ValueError(f"not JSON ({error})") from error
-    names = [field.name for field in fields(Row)]
-    if not isinstance(data, dict) or sorted(data) != sorted(names):
-        raise ValueError(f"expected an object with the fields {names}")
-    row = Row(**data)
-    numbers = (row.seconds, row.instance, row.seed, *([row.makespan] if row.ok else []))
-    if row.status not in STATUSES:
-        raise ValueError(f"status must be one of {STATUSES}, got {row.status!r}")
-    if not all(isinstance(number, (int, float)) for number in numbers) or (row.ok and not isinstance(row.tours, list)):
-        raise ValueError(
-            "instance, seed and seconds must be numbers, and so must makespan, with tours, if status is ok"
-        )
+    numbers = (row.budget, row.makespan, row.bound, row.length, row.seconds, row.cpu_seconds)
+    if not all(number is None or math.isfinite(number) for number in numbers):
+        raise ValueError("numbers must be finite")
+    if row.ok != (row.makespan is not None) or row.ok != (row.tours is not None):
+        raise ValueError(f"makespan and tours belong to status 'ok', and to no other; got {row.status!r}")
     return row
 
 
@@ -98,7 +108,7 @@ def parse_lines(path: Path, data: bytes) -> Iterator[Row]:
     """Parse the content of a file; a ValueError names ``path`` and the line."""
     for number, line in enumerate(data.splitlines(), start=1):
         try:
-            yield parse(line.decode("utf-8"))
+            yield parse(line)
         except ValueError as error:
             raise ValueError(f"{path}:{number}: damaged line: {error}") from error
 
@@ -108,12 +118,12 @@ def read(path: Path) -> list[Row]:
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: a damaged line; the message names the file and the line.
+        ValueError: not a regular file, or a damaged line; the message names the file and the line.
     """
-    data = path.read_bytes()
+    data = read_file(path)
     if path.suffix == ".gz":
         try:
             data = gzip.decompress(data)
-        except (EOFError, OSError) as error:
+        except (EOFError, OSError, zlib.error) as error:
             raise ValueError(f"{path}: not a whole gzip file ({error})") from error
     return list(parse_lines(path, data))

@@ -13,7 +13,8 @@ import numpy as np
 from scipy.stats import sem, wilcoxon
 
 from benchmarks import best_known
-from benchmarks.harness.rows import Row, read
+from benchmarks.harness.judge import TIE, read_judged
+from benchmarks.harness.rows import Row
 from benchmarks.solvers import SOLVERS
 from benchmarks.suite import (
     PUBLIC_SEED,
@@ -23,13 +24,10 @@ from benchmarks.suite import (
     PublicCell,
     TsplibCell,
     cells,
-    find_cell,
     rounded_bound,
 )
 from mtsp_env.instance import Instance
-from mtsp_env.tours import check_tours, farthest_trip, makespan
-
-TIE = 1e-9  # makespans that differ by less, relative to the best known, are equal
+from mtsp_env.tours import farthest_trip, makespan
 
 InstanceKey = tuple[int, int]
 """An instance of a cell: (seed, number)."""
@@ -154,61 +152,11 @@ def load(files: Sequence[Path], tsplib: Path | None = None, folder: Path = best_
 
     Raises:
         OSError: a file cannot be read.
-        ValueError: a damaged line; a makespan that differs from that of its tours; two networks under one name.
+        ValueError: as ``judge.read_judged``.
     """
-    latest: dict[tuple, Row] = {}
-    weights: dict[str, tuple[str, Path]] = {}
-    judge = _Judge(tsplib)
-    for file in files:
-        for number, row in enumerate(read(file), start=1):
-            try:
-                judge.check(row)
-                _check_weights(row, file, weights)
-            except ValueError as error:
-                raise ValueError(f"{file}:{number}: {error}") from error
-            latest[row.key] = row
+    latest = {row.key: row for row in read_judged(files, tsplib)}
     by_table = {table: [row for row in latest.values() if row.table == table] for table in TABLES}
     return [_results(table, rows, tsplib, folder) for table, rows in by_table.items() if rows]
-
-
-class _Judge:
-    """Checks the tours of rows; draws the instances of a cell when they are first needed."""
-
-    def __init__(self, tsplib: Path | None) -> None:
-        self.tsplib = tsplib
-        self.drawn: dict[str, list[Instance]] = {}
-
-    def check(self, row: Row) -> None:
-        cell = find_cell(row.table, row.cell)
-        if not row.ok or (isinstance(cell, TsplibCell) and self.tsplib is None):
-            return
-        instance = self._instance(cell, row.seed, row.instance)
-        check_tours(instance, row.tours)
-        judged = makespan(instance, row.tours)
-        if not math.isclose(judged, row.makespan, rel_tol=TIE):
-            raise ValueError(f"its makespan is {row.makespan!r}, that of its tours {judged!r}")
-
-    def _instance(self, cell: AnyCell, seed: int, number: int) -> Instance:
-        key = cell.file(seed)
-        if len(self.drawn.get(key, [])) <= number:
-            if isinstance(cell, TsplibCell):
-                cell = replace(cell, folder=self.tsplib)
-            else:
-                cell = replace(cell, count=max(cell.count, number + 1))
-            self.drawn[key] = cell.instances(seed)
-        if number >= len(self.drawn[key]):
-            raise ValueError(f"{cell.label} has no instance {number}")
-        return self.drawn[key][number]
-
-
-def _check_weights(row: Row, file: Path, seen: dict[str, tuple[str, Path]]) -> None:
-    if "weights" in row.versions:
-        first, first_file = seen.setdefault(row.method, (row.versions["weights"], file))
-        if first != row.versions["weights"]:
-            raise ValueError(
-                f"rows of {row.method} with weights {row.versions['weights']}, in {first_file} with {first}; "
-                "report them apart"
-            )
 
 
 def _results(table: str, table_rows: Sequence[Row], tsplib: Path | None, folder: Path) -> Results:

@@ -9,11 +9,12 @@ once per machine, and caches them on disk (``__pycache__``, or ``NUMBA_CACHE_DIR
 
 try:
     import numba  # noqa: F401
+    import scipy  # noqa: F401
 except ModuleNotFoundError as error:
-    if error.name != "numba":
+    if error.name not in ("numba", "scipy"):
         raise
     raise ModuleNotFoundError(
-        "mtsp_env.reference needs Numba: pip install 'mtsp-env[reference]'", name="numba"
+        f"mtsp_env.reference needs {error.name}: pip install 'mtsp-env[reference]'", name=error.name
     ) from error
 
 from mtsp_env.reference.solver import compile_kernels, improve, improve_batch

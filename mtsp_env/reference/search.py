@@ -6,10 +6,13 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from mtsp_env.instance import Tours
 from mtsp_env.reference import sisr
 from mtsp_env.tours import is_closed
+
+TREE_FROM = 300  # nodes from which a k-d tree finds the nearest cities sooner than trying all pairs
 
 
 def new_search(nodes: np.ndarray, n_agents: int, seed: int) -> sisr.Search:
@@ -17,7 +20,7 @@ def new_search(nodes: np.ndarray, n_agents: int, seed: int) -> sisr.Search:
     n, size = len(nodes), len(nodes) + n_agents
     xy = np.concatenate([nodes, np.repeat(nodes[:1], n_agents, axis=0)])  # (N, 2)
     x, y = np.ascontiguousarray(xy[:, 0]), np.ascontiguousarray(xy[:, 1])
-    near, near_distance = sisr.nearest_cities(x, y, n, min(sisr.N_NEAR, n - 2))
+    near, near_distance = nearest_cities(x[:n], y[:n], min(sisr.N_NEAR, n - 2))
     itself = np.arange(size, dtype=np.int32)  # an empty tour: the depot before and after itself
     return sisr.Search(
         x=x,
@@ -41,6 +44,22 @@ def new_search(nodes: np.ndarray, n_agents: int, seed: int) -> sisr.Search:
         length_log=np.zeros((2, n)),
         key=np.zeros(n),
     )
+
+
+def nearest_cities(x: np.ndarray, y: np.ndarray, n_near: int) -> tuple[np.ndarray, np.ndarray]:
+    """``near`` and ``near_distance`` of a search for nodes with the coordinates ``x`` and ``y`` (n,)."""
+    n = len(x)
+    if n < TREE_FROM:
+        return sisr.nearest_cities(x, y, n_near)
+    cities = np.stack([x[1:], y[1:]], axis=1)
+    distance, number = KDTree(cities).query(cities, k=n_near + 1)  # (n - 1, n_near + 1) each
+    itself = number == np.arange(n - 1)[:, None]
+    dropped = np.where(itself.any(axis=1), itself.argmax(axis=1), n_near)  # not listed if many cities coincide with it
+    kept = np.arange(n_near + 1) != dropped[:, None]
+    near, near_distance = np.zeros((n, n_near), np.int64), np.zeros((n, n_near))
+    near[1:] = number[kept].reshape(n - 1, n_near) + 1
+    near_distance[1:] = distance[kept].reshape(n - 1, n_near)
+    return near, near_distance
 
 
 def place_agents(search: sisr.Search, prefixes: Tours, driven: np.ndarray) -> None:

@@ -64,8 +64,9 @@ class Search(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def nearest_cities(x: np.ndarray, y: np.ndarray, n: int, n_near: int) -> tuple[np.ndarray, np.ndarray]:
-    """``near`` and ``near_distance`` of a Search for the first n nodes of ``x`` and ``y``. O(n^2) time."""
+def nearest_cities(x: np.ndarray, y: np.ndarray, n_near: int) -> tuple[np.ndarray, np.ndarray]:
+    """``near`` and ``near_distance`` of a Search for nodes with the coordinates ``x`` and ``y`` (n,). O(n^2) time."""
+    n = x.shape[0]
     near, distance = np.zeros((n, n_near), np.int64), np.zeros((n, n_near))
     for city in range(1, n if n_near else 0):
         n_listed = 0
@@ -84,21 +85,22 @@ def nearest_cities(x: np.ndarray, y: np.ndarray, n: int, n_near: int) -> tuple[n
 
 @njit(cache=True, nogil=True)
 def insert_greedily(search: Search, order: np.ndarray) -> None:
-    """Put the cities of ``order`` on the tours in this order, each where its tour stays shortest. O(n^2) time.
+    """Put the cities of ``order`` on the tours in this order, each where its tour stays shortest.
 
-    If there are heads, call ``load_tours`` and ``sum_lengths`` first; otherwise the tours must be empty.
+    The places are those next to one of the city's nearest cities or next to the depot, so this takes O(n m) time. If
+    there are heads, call ``load_tours`` and ``sum_lengths`` first; otherwise the tours must be empty.
     """
     depot = search.tour.shape[0] - search.length.shape[0]
     for city in order:
-        least, place = inf, depot
-        for node in range(1, search.tour.shape[0]):
-            agent = search.tour[node]
-            if agent >= 0:
-                before = search.previous[node]
-                detour = _distance(search, before, city) + _distance(search, city, node) - search.leg[node]
-                if search.length[agent] + detour < least:
-                    least, place = search.length[agent] + detour, before
-        search.length[search.tour[place]] = least
+        cheapest = _cheapest_near(search, city, inf, True, -1)
+        home = _distance(search, depot, city)
+        for agent in range(search.length.shape[0]):
+            if cheapest[0] <= 2.0 * home:  # no tour that visits the city is shorter
+                break
+            if search.length[agent] < cheapest[0]:
+                cheapest = _cheaper(search, city, depot + agent, home, inf, True, cheapest)
+        _, place, growth = cheapest
+        search.length[search.tour[place]] += growth
         _link(search, city, place)
     search.best[:] = search.next
 
@@ -311,17 +313,23 @@ def _recreate(search: Search, n_removed: int, makespan: float, limit: float) -> 
 def _cheapest_place(search: Search, city: int, makespan: float, balance: bool) -> tuple[int, float]:
     """The cheapest place for ``city``; returns (node before it, growth of the tour)."""
     depot = search.tour.shape[0] - search.length.shape[0]
-    blink = int(_random(search) * BLINK)
-    cheapest = (inf, depot, 0.0)
-    for k in range(search.near.shape[1]):
-        node = search.near[city, k]
-        if search.tour[node] >= 0 and k != blink:
-            cheapest = _cheaper(search, city, node, search.near_distance[city, k], makespan, balance, cheapest)
+    cheapest = _cheapest_near(search, city, makespan, balance, int(_random(search) * BLINK))
     home = _distance(search, depot, city)
     for node in range(depot, search.tour.shape[0]):  # never overlooked, so that there is always a place
         cheapest = _cheaper(search, city, node, home, makespan, balance, cheapest)
     _, place, growth = cheapest
     return place, growth
+
+
+@njit(cache=True, inline="always")
+def _cheapest_near(search: Search, city: int, makespan: float, balance: bool, blink: int) -> tuple[float, int, float]:
+    """The cheapest place next to a near city, number ``blink`` excepted: (cost, node before, growth of the tour)."""
+    cheapest = (inf, search.tour.shape[0] - search.length.shape[0], 0.0)
+    for k in range(search.near.shape[1]):
+        node = search.near[city, k]
+        if search.tour[node] >= 0 and k != blink:
+            cheapest = _cheaper(search, city, node, search.near_distance[city, k], makespan, balance, cheapest)
+    return cheapest
 
 
 @njit(cache=True, inline="always")
