@@ -17,6 +17,6 @@ except ModuleNotFoundError as error:
         f"mtsp_env.reference needs {error.name}: pip install 'mtsp-env[reference]'", name=error.name
     ) from error
 
-from mtsp_env.reference.solver import compile_kernels, improve, improve_batch
+from mtsp_env.reference.solver import compile_kernels, improve, improve_batch, plan_rest
 
-__all__ = ["compile_kernels", "improve", "improve_batch"]
+__all__ = ["compile_kernels", "improve", "improve_batch", "plan_rest"]

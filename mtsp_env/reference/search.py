@@ -5,22 +5,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.spatial import KDTree
 
 from mtsp_env.instance import Tours
 from mtsp_env.reference import sisr
-from mtsp_env.tours import is_closed
 
 TREE_FROM = 300  # nodes from which a k-d tree finds the nearest cities sooner than trying all pairs
 
 
-def new_search(nodes: np.ndarray, n_agents: int, seed: int) -> sisr.Search:
-    """A search over ``nodes`` (n, 2) with empty tours."""
+def new_search(
+    nodes: np.ndarray,
+    n_agents: int,
+    seed: int,
+    speeds: np.ndarray | None = None,
+    service: np.ndarray | None = None,
+) -> sisr.Search:
+    """A search over ``nodes`` (n, 2) with empty tours, with the ``speeds`` (m,) and ``service`` (n,) of a world."""
     n, size = len(nodes), len(nodes) + n_agents
     xy = np.concatenate([nodes, np.repeat(nodes[:1], n_agents, axis=0)])  # (N, 2)
     x, y = np.ascontiguousarray(xy[:, 0]), np.ascontiguousarray(xy[:, 1])
     near, near_distance = nearest_cities(x[:n], y[:n], min(sisr.N_NEAR, n - 2))
+    pace = None if speeds is None and service is None else np.ones(n_agents) if speeds is None else 1.0 / speeds
+    visits = None if pace is None else np.zeros(size)
+    if visits is not None and service is not None:
+        visits[:n] = service
     itself = np.arange(size, dtype=np.int32)  # an empty tour: the depot before and after itself
     return sisr.Search(
         x=x,
@@ -43,6 +54,8 @@ def new_search(nodes: np.ndarray, n_agents: int, seed: int) -> sisr.Search:
         tour_log=np.zeros((2, n), np.int32),
         length_log=np.zeros((2, n)),
         key=np.zeros(n),
+        pace=pace,
+        service=visits,
     )
 
 
@@ -62,31 +75,31 @@ def nearest_cities(x: np.ndarray, y: np.ndarray, n_near: int) -> tuple[np.ndarra
     return near, near_distance
 
 
-def place_agents(search: sisr.Search, prefixes: Tours, driven: np.ndarray) -> None:
-    """Put each agent where its prefix ends, ``driven`` (m,) from the depot.
+def place_agents(search: sisr.Search, heads: Sequence[int | None], driven: np.ndarray) -> None:
+    """Put each agent at its head (0: the depot; None: it gets no cities), its own time there being ``driven`` (m,).
 
-    Nodes 1, 2, ... of ``search`` must be the last cities of the prefixes that end at a city, in the agents' order.
+    Nodes 1, 2, ... of ``search`` must be the heads that are cities, in the agents' order.
     """
-    depot, head, order = len(search.near), 1, []
-    for agent, prefix in enumerate(prefixes):
-        if prefix[-1] != 0:
-            search.head[agent] = head
-            order.append(head)
-            head += 1
-        elif is_closed(prefix):
+    depot, number, order = len(search.near), 1, []
+    for agent, head in enumerate(heads):
+        if head is None:
             search.head[agent] = depot + agent
+        elif head != 0:
+            search.head[agent] = number
+            order.append(number)
+            number += 1
         order.append(0)
     search.driven[:] = driven
     sisr.load_tours(search, np.array(order, dtype=np.int64))
 
 
-def remaining_order(tours: Tours, prefixes: Tours, remaining: list[int]) -> np.ndarray:
-    """The part of ``tours`` after ``prefixes`` in the form of ``sisr.load_tours``, int64 (len(remaining) - 1 + m,).
+def remaining_order(heads: Sequence[int | None], routes: Sequence[Sequence[int]], remaining: list[int]) -> np.ndarray:
+    """Heads and the ``routes`` after them in the form of ``sisr.load_tours``, int64.
 
-    Node i of the search is node ``remaining[i]`` of the tours.
+    Node i of the search is node ``remaining[i]`` of the heads and routes.
     """
     number = {node: i for i, node in enumerate(remaining)}
-    rests = [tour[max(0, len(prefix) - 1) :] for tour, prefix in zip(tours, prefixes, strict=True)]
+    rests = [[head or 0, *route] for head, route in zip(heads, routes, strict=True)]
     return np.array([i for rest in rests for i in [*(number[node] for node in rest if node != 0), 0]], dtype=np.int64)
 
 

@@ -13,6 +13,9 @@ nodes 1..n-1 are the cities. Node n + a is agent a's own copy of the depot, both
 An agent that is under way has a *head*: the city that it is at or going to, the last one that is fixed. The leg to a
 head has length -inf, so that the place before it is never the cheapest; the inner loop needs no test for heads.
 
+Legs are distances, tours are times. In plain problems these are the same, and ``pace`` and ``service`` are None: Numba
+then compiles kernels without them, so that plain problems do not pay for worlds.
+
 All kernels are in this file because Numba's cache on disk notices changes only in a compiled function's own file.
 """
 
@@ -22,7 +25,8 @@ from math import inf, log, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+from numba import njit, types
+from numba.extending import overload
 
 # Chosen on uniform instances of 50 to 1000 nodes. Halving or doubling any of them changes little, except N_NEAR.
 TOTAL_WEIGHT = 0.01  # of the total length, relative to the makespan
@@ -49,10 +53,10 @@ class Search(NamedTuple):
     next: np.ndarray  # (N,) int32
     leg: np.ndarray  # (N,) float64, distance from the previous node
     tour: np.ndarray  # (N,) int32, the agent on whose tour the node is; -1: on none
-    length: np.ndarray  # (m,) float64, length of each tour
+    length: np.ndarray  # (m,) float64, time of each tour; if plain, its length
     n_movable: np.ndarray  # (m,) int32, cities on each tour that may be moved: all but the head
     head: np.ndarray  # (m,) int32, the fixed first city of each tour; 0: none; the agent's depot: the tour is closed
-    driven: np.ndarray  # (m,) float64, length of each tour up to its head
+    driven: np.ndarray  # (m,) float64, time of each tour up to its head, the visit there included
     ruined: np.ndarray  # (m,) int64, the last iteration that removed a string from the tour
     best: np.ndarray  # (N,) int32, ``next`` of the best tours so far
     random: np.ndarray  # (1,) uint64, state of the random number generator, not 0
@@ -61,6 +65,8 @@ class Search(NamedTuple):
     tour_log: np.ndarray  # (2, n) int32, the tour of each logged city
     length_log: np.ndarray  # (2, n) float64, the length of that tour before the change
     key: np.ndarray  # (n,) float64, sort keys of the removed cities
+    pace: np.ndarray | None = None  # (m,) float64, time per distance of each agent; None: 1
+    service: np.ndarray | None = None  # (N,) float64, time that a visit takes, 0 at the depots; None if pace is None
 
 
 @njit(cache=True, nogil=True)
@@ -90,12 +96,13 @@ def insert_greedily(search: Search, order: np.ndarray) -> None:
     The places are those next to one of the city's nearest cities or next to the depot, so this takes O(n m) time. If
     there are heads, call ``load_tours`` and ``sum_lengths`` first; otherwise the tours must be empty.
     """
-    depot = search.tour.shape[0] - search.length.shape[0]
+    depot, fastest = search.tour.shape[0] - search.length.shape[0], _fastest(search.pace)
     for city in order:
         cheapest = _cheapest_near(search, city, inf, True, -1)
         home = _distance(search, depot, city)
+        shortest = _time(search.pace, search.service, fastest, 2.0 * home, city)
         for agent in range(search.length.shape[0]):
-            if cheapest[0] <= 2.0 * home:  # no tour that visits the city is shorter
+            if cheapest[0] <= shortest:  # no tour that visits the city is shorter
                 break
             if search.length[agent] < cheapest[0]:
                 cheapest = _cheaper(search, city, depot + agent, home, inf, True, cheapest)
@@ -143,7 +150,7 @@ def best_order(search: Search) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def sum_lengths(search: Search) -> float:
-    """Compute the tours' lengths and the legs from the coordinates; returns the makespan."""
+    """Compute the tours' times and the legs from the coordinates; returns the makespan."""
     n_agents = search.length.shape[0]
     depot = search.tour.shape[0] - n_agents
     for agent in range(n_agents):
@@ -154,7 +161,7 @@ def sum_lengths(search: Search) -> float:
         while search.head[agent] != depot + agent:
             before, node = node, search.next[node]
             search.leg[node] = _distance(search, before, node)
-            length += search.leg[node]
+            length += _time(search.pace, search.service, agent, search.leg[node], node)
             if node >= depot:
                 break
         search.length[agent] = length
@@ -263,7 +270,7 @@ def _remove_string(search: Search, n_removed: int, city: int, agent: int, max_st
             n_removed += 1
             legs = search.leg[node] + search.leg[following]
             _unlink(search, node)
-            search.length[agent] += search.leg[following] - legs
+            search.length[agent] -= _time(search.pace, search.service, agent, legs - search.leg[following], node)
         node = following
     return n_removed
 
@@ -344,15 +351,18 @@ def _cheaper(
 ) -> tuple[float, int, float]:
     """The cheapest of ``cheapest`` (cost, node before, growth of the tour) and the places before and after ``node``."""
     least, place, place_growth = cheapest
-    length = search.length[search.tour[node]]
+    agent = search.tour[node]
+    length = search.length[agent]
     offset = length if balance else 0.0
     for side in range(2):  # before the node, after it
         end = node if side == 0 else search.next[node]
         # Quick bound: either the leg's other end is at least as far from the city, or the leg has been tried from there
-        if 2.0 * to_node - search.leg[end] + offset >= least:
+        least_detour = 2.0 * to_node - search.leg[end]
+        if _time(search.pace, search.service, agent, least_detour, city) + offset >= least:
             continue
         other = search.previous[node] if side == 0 else end
-        growth = to_node + _distance(search, other, city) - search.leg[end]
+        detour = to_node + _distance(search, other, city) - search.leg[end]
+        growth = _time(search.pace, search.service, agent, detour, city)
         cost = offset + growth
         if not balance and length + growth > makespan:
             cost += (length + growth - makespan) / TOTAL_WEIGHT
@@ -392,6 +402,34 @@ def _unlink(search: Search, city: int) -> None:
     search.leg[following] = _distance(search, before, following)
     search.n_movable[search.tour[city]] -= 1
     search.tour[city] = -1
+
+
+# Numba picks one of the implementations below as it compiles a kernel, and compiles it into its callers. It compares
+# signatures, so overloads have no annotations
+
+
+def _time(pace: np.ndarray | None, service: np.ndarray | None, agent: int, distance: float, node: int) -> float:
+    """How long ``agent`` takes for ``distance`` and for its visit to ``node``."""
+    return distance if pace is None or service is None else pace[agent] * distance + service[node]
+
+
+@overload(_time, inline="always")
+def _compile_time(pace, service, agent, distance, node):  # type: ignore[no-untyped-def]
+    if isinstance(pace, types.NoneType):
+        return lambda pace, service, agent, distance, node: distance
+    return lambda pace, service, agent, distance, node: pace[agent] * distance + service[node]
+
+
+def _fastest(pace: np.ndarray | None) -> int:
+    """The fastest agent."""
+    return 0 if pace is None else int(pace.argmin())
+
+
+@overload(_fastest, inline="always")
+def _compile_fastest(pace):  # type: ignore[no-untyped-def]
+    if isinstance(pace, types.NoneType):
+        return lambda pace: 0
+    return lambda pace: pace.argmin()
 
 
 @njit(cache=True, inline="always")

@@ -13,17 +13,17 @@ import functools
 import itertools
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from mtsp_env.checks import check_count, check_seconds
-from mtsp_env.instance import Instance, Tours, check_arrays, check_plain
+from mtsp_env.instance import Instance, Tours, check_arrays
 from mtsp_env.machine import check_memory, usable_cores
 from mtsp_env.reference import sisr
 from mtsp_env.reference.search import as_order, as_tours, new_search, place_agents, remaining_order
-from mtsp_env.tours import check_prefixes, check_tours, farthest_trip, is_closed, makespan, path_lengths
+from mtsp_env.tours import check_prefixes, check_tours, farthest_trip, is_closed, makespan, tour_times
 
 ITERATIONS_PER_NODE = 500  # if neither seconds nor iterations are given
 # First and last temperature. The unit is the makespan times sqrt(m / n), the length of a few average legs.
@@ -44,16 +44,19 @@ def improve(
     iterations: int | None = None,
     seed: int = 0,
     prefixes: Sequence[Sequence[int]] | None = None,
+    stopped: Collection[int] = (),
 ) -> Tours:
     """Near-optimal tours for ``instance``, never worse than the given ``tours``.
 
-    With ``prefixes``, plans the remaining tours of a team that is already under way.
+    Agents may differ in speed, and visits may take time. With ``prefixes``, plans the remaining tours of a team that is
+    already under way. In worlds that change (``appears``, ``breaks``, ``traffic``) no tours can be planned in advance:
+    there, ``mtsp_env.replan.Replanner`` plans again whenever something happens.
 
     The search ends after ``seconds`` or ``iterations``, whichever comes first; if neither is given, after 500
     iterations per node. It ends early if the makespan equals the trip to the farthest city and back, which is optimal.
 
     Args:
-        instance: the problem; it must be plain.
+        instance: the problem; its only world fields may be ``speeds`` and ``service``.
         tours: start from these; if None, or if greedy insertion is shorter, start from greedy insertion.
         seconds: limit on the wall time, above 0. Preparation takes O(n log n + n m) time and is never cut short: 0.01 s
             at n = 1000, 0.2 s at n = 20,000. Compiling or loading the kernels, once per process, does not count
@@ -63,31 +66,36 @@ def improve(
         seed: a whole number of at least 0.
         prefixes: how each agent's tour begins (``mtsp_env.tours.check_prefixes``). [0, 3, 5]: the agent has visited
             city 3 and is at city 5 or on its way there; [0]: it has not left yet; [0, 3, 0]: it is home for good.
-            The objective is still the length of the whole tours.
+            The objective is still the time of the whole tours.
+        stopped: agents that go no further, such as broken ones. Their tours are their prefixes, and others visit the
+            remaining cities.
 
     Returns:
         One tour per agent, [0, ..., 0]; a copy of ``tours`` if the search has found nothing shorter.
 
     Raises:
-        ValueError: the instance has world fields, the tours do not solve it or do not begin with the prefixes, no tours
-            that solve it begin with the prefixes, a number is outside its range, or the search does not fit into the
-            memory.
+        ValueError: the instance has other world fields, the tours do not solve it or do not begin with the prefixes, no
+            tours that solve it begin with the prefixes, a number is outside its range, or the search does not fit into
+            the memory.
     """
-    check_plain(instance)
+    _check_world(instance.world)
     if seconds is not None:
         check_seconds("seconds", seconds)
     _check_search(iterations, seed)
     _check_fits(instance.n_nodes, instance.n_agents)
     fixed = None if prefixes is None else check_prefixes(instance, prefixes)
+    if stopped:
+        fixed = _check_stopped(instance, fixed, stopped)
     start = None
     if tours is not None:
-        check_tours(instance, tours)
+        check_tours(instance, [[*tour, 0] if agent in stopped else tour for agent, tour in enumerate(tours)])
         start = [[int(node) for node in tour] for tour in tours]
         for agent, (tour, prefix) in enumerate(zip(start, fixed or [], strict=False)):
-            if tour[: len(prefix)] != prefix or (is_closed(prefix) and tour != prefix):
-                raise ValueError(f"tour {agent} must begin with its prefix {prefix}, got {tour}")
-    compile_kernels()
-    solution = _solve(instance.nodes, instance.n_agents, start, seconds, iterations, seed, prefixes=fixed)
+            final = is_closed(prefix) or agent in stopped
+            if tour[: len(prefix)] != prefix or (final and tour != prefix):
+                raise ValueError(f"tour {agent} must {'be' if final else 'begin with'} its prefix {prefix}, got {tour}")
+    compile_kernels(worlds=instance.world != ())
+    solution = _solve(instance, start, seconds, iterations, seed, prefixes=fixed, stopped=stopped)
     if start is not None and makespan(instance, start) <= makespan(instance, solution):
         return start
     return solution
@@ -134,15 +142,76 @@ def improve_batch(
     _check_fits(nodes.shape[1], n_agents)
     threads = len(usable_cores()) if threads is None else threads
     check_count("threads", threads, minimum=1)
+    instances = [Instance(row, n_agents) for row in nodes]
     fixed: list[Tours | None] = [None] * len(nodes)
     if prefixes is not None:
         if len(prefixes) != len(nodes):
             raise ValueError(f"expected prefixes for {len(nodes)} instances, got {len(prefixes)}")
-        fixed = [check_prefixes(Instance(row, n_agents), begun) for row, begun in zip(nodes, prefixes, strict=True)]
+        fixed = [check_prefixes(instance, begun) for instance, begun in zip(instances, prefixes, strict=True)]
     compile_kernels()
     with ThreadPoolExecutor(threads) as pool:
-        solve = functools.partial(_solve, n_agents=n_agents, iterations=iterations, seed=seed, tidy=tidy)
-        return list(pool.map(lambda row, prefixes: solve(row, prefixes=prefixes), nodes, fixed))
+        solve = functools.partial(_solve, iterations=iterations, seed=seed, tidy=tidy)
+        return list(pool.map(lambda instance, prefixes: solve(instance, prefixes=prefixes), instances, fixed))
+
+
+def plan_rest(
+    instance: Instance,
+    heads: Sequence[int | None],
+    driven: np.ndarray,
+    cities: Sequence[int],
+    routes: Sequence[Sequence[int]] | None = None,
+    seconds: float | None = None,
+    iterations: int | None = None,
+    seed: int = 0,
+) -> Tours:
+    """The rest of each agent's tour if agents are on their way and only some of the cities are left to visit.
+
+    Minimises the makespan plus 1 % of the total time, so that all tours are short, and never ends early. World fields
+    other than ``speeds`` and ``service`` are ignored.
+
+    Args:
+        instance: where the nodes are, and what the agents and visits are like.
+        heads: the node from which each agent goes on, 0 for the depot; None: it gets no cities. No city twice.
+        driven: (m,) own time at which each agent can leave its head.
+        cities: the cities to visit, without the heads.
+        routes: start from these, the cities after each head in order, if greedy insertion is not shorter. Cities that
+            are missing are inserted.
+        seconds, iterations, seed: as for ``improve``.
+
+    Returns:
+        The cities of each agent after its head, in order; the way home is implied.
+
+    Raises:
+        ValueError: every head is None while cities are left.
+    """
+    if all(head is None for head in heads) and len(cities):
+        raise ValueError(f"{len(cities)} cities are left, and every agent has stopped")
+    compile_kernels(worlds=instance.speeds is not None or instance.service is not None)
+    return _plan_rest(
+        instance, heads, driven, cities, routes, 0.0, True, seconds, iterations, seed, time.perf_counter()
+    )
+
+
+def _check_world(world: Sequence[str]) -> None:
+    changing = [name for name in world if name not in ("speeds", "service")]
+    if changing:
+        raise ValueError(
+            f"tours cannot be planned in advance in a world with {changing}: mtsp_env.replan.Replanner plans again "
+            "whenever something happens"
+        )
+
+
+def _check_stopped(instance: Instance, prefixes: Tours | None, stopped: Collection[int]) -> Tours:
+    """The prefixes, by default of agents that have not left; ValueError unless the other agents can visit the rest."""
+    for agent in stopped:
+        check_count("an agent in stopped", agent, minimum=0)
+        if agent >= instance.n_agents:
+            raise ValueError(f"stopped must name agents in 0..{instance.n_agents - 1}, got {agent}")
+    prefixes = [[0] for _ in range(instance.n_agents)] if prefixes is None else prefixes
+    left = instance.n_nodes - len({0}.union(*prefixes))
+    if left and all(agent in stopped or is_closed(prefix) for agent, prefix in enumerate(prefixes)):
+        raise ValueError(f"all agents are stopped or home for good, and {left} cities are left")
+    return prefixes
 
 
 def _check_search(iterations: int | None, seed: int) -> None:
@@ -157,49 +226,87 @@ def _check_fits(n_nodes: int, n_agents: int) -> None:
 
 
 @functools.cache
-def compile_kernels() -> None:
-    """Compile every kernel, or load it from disk, unless this process has done so.
+def compile_kernels(worlds: bool = False) -> None:
+    """Compile every kernel, for plain problems or for ``worlds``, or load it from disk, once per process.
 
     ``improve`` and ``improve_batch`` call this themselves; call it first to keep compilation out of a measured time.
     """
-    _solve(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), 1, [[0, 1, 2, 0]], None, 1, 0)
+    corner = Instance(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), 1, service=np.zeros(3) if worlds else None)
+    _solve(corner, [[0, 1, 2, 0]], None, 1, 0)
 
 
 def _solve(
-    nodes: np.ndarray,
-    n_agents: int,
+    instance: Instance,
     tours: Tours | None = None,
     seconds: float | None = None,
     iterations: int | None = None,
     seed: int = 0,
     tidy: bool = False,
     prefixes: Tours | None = None,
+    stopped: Collection[int] = (),
 ) -> Tours:
     """``improve`` without its checks."""
     started = time.perf_counter()
-    bound = farthest_trip(nodes)  # the other part of tours.lower_bound, the spanning tree, is never attained
-    if prefixes is None:
+    n, m = instance.n_nodes, instance.n_agents
+    bound = _farthest_trip(instance)  # the other part of tours.lower_bound, the spanning tree, is never attained
+    if prefixes is None and instance.speeds is None:
         # At most one agent per city is of use
-        search = new_search(nodes, min(n_agents, len(nodes) - 1), seed)
+        search = new_search(instance.nodes, min(m, n - 1), seed, service=instance.service)
         start = None if tours is None else as_order(tours, len(search.best) - 1)
         _optimise(search, 1, start, bound, tidy, seconds, iterations, started)
-        return as_tours(sisr.best_order(search), n_agents)
+        return as_tours(sisr.best_order(search), m)
 
-    heads = [prefix[-1] for prefix in prefixes if prefix[-1] != 0]
-    unvisited = sorted(set(range(1, len(nodes))).difference(*prefixes))
-    if not unvisited:
-        return [prefix if is_closed(prefix) else [*prefix, 0] for prefix in prefixes]
-    remaining = [0, *heads, *unvisited]  # the nodes of the remaining problem, in which node i is remaining[i]
-    search = new_search(nodes[remaining], n_agents, seed)
-    place_agents(search, prefixes, path_lengths(nodes, prefixes))
-    bound = max(bound, sisr.sum_lengths(search))  # every agent must at least go home from its head
-    start = None if tours is None else remaining_order(tours, prefixes, remaining)
-    _optimise(search, 1 + len(heads), start, bound, tidy, seconds, iterations, started)
-    rest = as_tours(sisr.best_order(search), n_agents)
+    prefixes = [[0] for _ in range(m)] if prefixes is None else prefixes
+    final = [is_closed(prefix) or agent in stopped for agent, prefix in enumerate(prefixes)]
+    heads = [None if final[agent] else prefix[-1] for agent, prefix in enumerate(prefixes)]
+    unvisited = sorted(set(range(1, n)).difference(*prefixes))
+    routes = None
+    if tours is not None:
+        routes = [tour[len(prefix) :] for tour, prefix in zip(tours, prefixes, strict=True)]
+    driven = tour_times(instance, prefixes)
+    bound = 0.0 if stopped else bound  # a stopped agent does not drive home from the farthest city
+    rest = _plan_rest(instance, heads, driven, unvisited, routes, bound, tidy, seconds, iterations, seed, started)
     return [
-        prefix if is_closed(prefix) else [*prefix, *(remaining[node] for node in tour[1 if prefix == [0] else 2 :])]
-        for prefix, tour in zip(prefixes, rest, strict=True)
+        prefix if final[agent] else [*prefix, *route, 0]
+        for agent, (prefix, route) in enumerate(zip(prefixes, rest, strict=True))
     ]
+
+
+def _farthest_trip(instance: Instance) -> float:
+    """A lower bound on the makespan: the fastest agent goes to a city and home."""
+    if instance.world == ():
+        return farthest_trip(instance.nodes)
+    fastest = 1.0 if instance.speeds is None else float(instance.speeds.max())
+    visits = 0.0 if instance.service is None else instance.service
+    return float((2.0 * np.linalg.norm(instance.nodes - instance.nodes[0], axis=1) / fastest + visits).max())
+
+
+def _plan_rest(
+    instance: Instance,
+    heads: Sequence[int | None],
+    driven: np.ndarray,
+    cities: Sequence[int],
+    routes: Sequence[Sequence[int]] | None,
+    bound: float,
+    tidy: bool,
+    seconds: float | None,
+    iterations: int | None,
+    seed: int,
+    started: float,
+) -> Tours:
+    """``plan_rest``, with a lower ``bound`` on the makespan, at which the search ends unless ``tidy``."""
+    if not cities:
+        return [[] for _ in heads]
+    at_cities = [head for head in heads if head]
+    remaining = [0, *at_cities, *cities]  # the nodes of the remaining problem, in which node i is remaining[i]
+    service = None if instance.service is None else instance.service[remaining]
+    search = new_search(instance.nodes[remaining], len(heads), seed, instance.speeds, service)
+    place_agents(search, heads, driven)
+    bound = max(bound, sisr.sum_lengths(search))  # every agent must at least go home from its head
+    start = None if routes is None else remaining_order(heads, routes, remaining)
+    _optimise(search, 1 + len(at_cities), start, bound, tidy, seconds, iterations, started)
+    rest = as_tours(sisr.best_order(search), len(heads))
+    return [[remaining[node] for node in tour[2 if head else 1 : -1]] for head, tour in zip(heads, rest, strict=True)]
 
 
 def _optimise(
@@ -214,16 +321,23 @@ def _optimise(
 ) -> None:
     """Insert the cities from ``first_unvisited`` on greedily, load the tours ``start`` if they are better, and anneal.
 
-    ``bound`` is a lower bound on the makespan, at which the search ends.
+    Cities that are missing in ``start`` are inserted greedily there. ``bound`` is a lower bound on the makespan, at
+    which the search ends.
     """
     n = len(search.near)
     home = np.hypot(search.x[:n] - search.x[0], search.y[:n] - search.y[0])
-    sisr.insert_greedily(search, first_unvisited + np.argsort(-home[first_unvisited:], kind="stable"))
+    farthest_first = first_unvisited + np.argsort(-home[first_unvisited:], kind="stable")
+    sisr.insert_greedily(search, farthest_first)
     greedy = best = sisr.sum_lengths(search)
     if start is not None:
         inserted = sisr.best_order(search)
+        missing = farthest_first[~np.isin(farthest_first, start)]
+        search.tour[missing] = -1
         sisr.load_tours(search, start)
         best = sisr.sum_lengths(search)
+        if len(missing):
+            sisr.insert_greedily(search, missing)
+            best = sisr.sum_lengths(search)
         if best >= greedy:
             sisr.load_tours(search, inserted)
             best = sisr.sum_lengths(search)
