@@ -13,11 +13,11 @@ def check_count(name: str, value: int, minimum: int) -> None:
         raise ValueError(f"{name} must be a whole number of at least {minimum}, got {value!r}")
 
 
-def check_seconds(name: str, value: float) -> None:
-    """Raise ValueError unless ``value`` is a finite number of seconds above 0."""
+def check_seconds(name: str, value: float, unit: str = "seconds") -> None:
+    """Raise ValueError unless ``value``, in ``unit``, is a finite time above 0."""
     try:
         valid = not isinstance(value, (str, bool)) and math.isfinite(value) and value > 0
     except TypeError:
         valid = False
     if not valid:
-        raise ValueError(f"{name} must be a finite number of seconds above 0, got {value!r}")
+        raise ValueError(f"{name} must be a finite number of {unit} above 0, got {value!r}")
