@@ -55,8 +55,9 @@ class DANConfig:
             if norm not in ("pre", "post"):
                 raise ValueError(f"unknown norm {norm!r}; choose from ['pre', 'post']")
         check_clip(self.tanh_clip)
-        if type(self.prune_visited) is not bool:
-            raise ValueError(f"prune_visited must be True or False, got {self.prune_visited!r}")
+        for name in ("prune_visited", "assignment"):
+            if type(getattr(self, name)) is not bool:
+                raise ValueError(f"{name} must be True or False, got {getattr(self, name)!r}")
         if self.view is not None and not (type(self.view) is int and self.view >= 1 and self.prune_visited):
             raise ValueError(f"view must be None, or with prune_visited at least 1 city, got {self.view!r}")
 

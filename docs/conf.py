@@ -53,6 +53,7 @@ PAGES_OF_FILES = {
     "../CONTRIBUTING.md": "contributing.md",
     "../CHANGELOG.md": "changelog.md",
     "../dan_policy/weights/README.md": "model-cards.md",
+    "../benchmarks/policies/weights/README.md": "measured/networks.md",
     "../benchmarks/results/report.md": "measured/report.md",
     "../benchmarks/results/ablations.md": "measured/ablations.md",
     "../benchmarks/results/clip.md": "measured/clip.md",

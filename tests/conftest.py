@@ -1,6 +1,8 @@
 """Fixtures for all tests: a square solved by hand, and a folder with its files. Pictures never open a window."""
 
 import os
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 os.environ["MPLBACKEND"] = "Agg"  # before anything imports matplotlib
@@ -12,6 +14,15 @@ from mtsp_env import Instance, write_instance
 
 # For `make fuzz`. Tests in tests/fuzz say nothing about max_examples, so that a profile decides: by default 100.
 settings.register_profile("fuzz", max_examples=10_000, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+@pytest.fixture(autouse=True)
+def signals_as_before() -> Iterator[None]:
+    """What a command does on Ctrl-C and SIGTERM ends with the test that ran it in this process."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture

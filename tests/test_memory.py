@@ -1,5 +1,7 @@
 """The study of memory runs every case and notices growth."""
 
+import mmap
+
 import pytest
 
 from benchmarks.__main__ import main
@@ -17,7 +19,8 @@ def test_growth_is_noticed(monkeypatch):
     def leak():
         kept = []
         while True:
-            kept.append(bytearray(b"x" * 2**20))
+            kept.append(mmap.mmap(-1, 2**20))  # new pages, never ones that the process has freed before
+            kept[-1].write(b"x" * 2**20)
             yield
 
     monkeypatch.setitem(memory.CASES, "leak", (leak, 50))

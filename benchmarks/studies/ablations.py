@@ -74,6 +74,7 @@ DAN_VARIANTS = (
 
 DENSE_LABELS = (
     Variant("DAN", imitation=1.0),
+    Variant("DAN, agent of every city", imitation=1.0, network={"assignment": True}, assignment_weight=1.0),
     Variant("joint", imitation=1.0, policy="joint"),
     Variant("joint, next node of every agent", imitation=1.0, policy="joint", next_weight=0.5),
     Variant("joint, agent of every city", imitation=1.0, policy="joint", assignment_weight=1.0),
