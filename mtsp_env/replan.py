@@ -50,6 +50,8 @@ class Replanner:
     about the future enters it: no city that has not appeared, no time of a breakdown, no traffic on a leg that is not
     finished; a leg is expected to take as long as announced. Between events it follows its plan.
 
+    Use one for each environment that plays single games: between games it forgets its plan.
+
     It needs to know everything that anybody knows, and so plays no games with ``view`` or ``hearing``.
 
     Args:

@@ -18,9 +18,9 @@ from mtsp_env.instance import Tours
 from mtsp_env.tours import path_lengths
 
 pytest.importorskip("numba", reason="needs the extra reference")
-from mtsp_env.reference import improve, improve_batch, sisr, solver
+from mtsp_env.reference import annealing, improve, improve_batch, sisr, solver
 from mtsp_env.reference import search as search_arrays
-from mtsp_env.reference.solver import END_TEMPERATURE, START_TEMPERATURE
+from mtsp_env.reference.annealing import END_TEMPERATURE, START_TEMPERATURE
 
 ROOT = Path(__file__).parents[1]
 
@@ -82,7 +82,8 @@ def turns(monkeypatch) -> list[tuple[int, float, float]]:
 
     clock = SimpleNamespace(perf_counter=lambda: 5.0 + 1e-4 * sum(iterations for iterations, _, _ in calls))
     monkeypatch.setattr(sisr, "anneal", recorded)
-    monkeypatch.setattr(solver, "time", clock)
+    for module in (solver, annealing):
+        monkeypatch.setattr(module, "time", clock)
     return calls
 
 

@@ -3,8 +3,8 @@
 >>> tours = improve(uniform(np.random.default_rng(0), n_nodes=50, n_agents=5), seconds=0.005)
 
 A ruin-and-recreate local search that starts from greedy insertion or from given tours. ``solver`` holds the public
-functions, ``search`` the arrays of a search, ``sisr`` the compiled kernels. Numba compiles the kernels at first use,
-once per machine, and caches them on disk (``__pycache__``, or ``NUMBA_CACHE_DIR``).
+functions, ``annealing`` the search, ``search`` its arrays, ``sisr`` the compiled kernels. Numba compiles the kernels at
+first use, once per machine, and caches them on disk (``__pycache__``, or ``NUMBA_CACHE_DIR``).
 """
 
 try:

@@ -1,6 +1,6 @@
 """The arrays of a search: made from an instance, tours and prefixes, and turned back into tours.
 
-``solver`` calls these functions and the compiled kernels in ``sisr``.
+``solver`` calls these functions, and ``annealing`` the compiled kernels in ``sisr``.
 """
 
 from __future__ import annotations

@@ -10,8 +10,6 @@ after 1 s and 0.01 to 0.4 % after 5 s. That of OR-Tools 9.15, guided local searc
 from __future__ import annotations
 
 import functools
-import itertools
-import math
 import time
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -22,19 +20,11 @@ from mtsp_env.checks import check_count, check_seconds
 from mtsp_env.instance import Instance, Tours, check_arrays
 from mtsp_env.machine import check_memory, usable_cores
 from mtsp_env.reference import sisr
+from mtsp_env.reference.annealing import optimise
 from mtsp_env.reference.search import as_order, as_tours, new_search, place_agents, remaining_order
 from mtsp_env.tours import check_prefixes, check_tours, farthest_trip, is_closed, makespan, tour_times
 
-ITERATIONS_PER_NODE = 500  # if neither seconds nor iterations are given
-# First and last temperature. The unit is the makespan times sqrt(m / n), the length of a few average legs.
-START_TEMPERATURE, END_TEMPERATURE = 0.1, 0.0025
-# A single annealing may settle for a bad division of the cities among the agents, most often if the cities cluster.
-# There are four, each twice as long as the one before and from the best tours so far: 0.3 % shorter on average.
-ROUNDS = [0, 1 / 15, 3 / 15, 7 / 15, 1]  # their beginnings and ends, as fractions of the whole search
-MIN_TURN_SECONDS = 5e-4  # least time between two looks at the clock, so that calls of the kernel cost little
-FIRST_GUESS, FIRST_GUESS_PER_AGENT = 1e-5, 3e-8  # seconds of an iteration, until the first ones have been timed
 BYTES_PER_NODE, BYTES_PER_AGENT = 2000, 200  # measured: what a search needs at its peak, with its tours as lists
-OPTIMALITY_TOLERANCE = 1e-9  # a makespan this close to the lower bound is optimal
 
 
 def improve(
@@ -253,7 +243,7 @@ def _solve(
         # At most one agent per city is of use
         search = new_search(instance.nodes, min(m, n - 1), seed, service=instance.service)
         start = None if tours is None else as_order(tours, len(search.best) - 1)
-        _optimise(search, 1, start, bound, tidy, seconds, iterations, started)
+        optimise(search, 1, start, bound, tidy, seconds, iterations, started)
         return as_tours(sisr.best_order(search), m)
 
     prefixes = [[0] for _ in range(m)] if prefixes is None else prefixes
@@ -304,88 +294,6 @@ def _plan_rest(
     place_agents(search, heads, driven)
     bound = max(bound, sisr.sum_lengths(search))  # every agent must at least go home from its head
     start = None if routes is None else remaining_order(heads, routes, remaining)
-    _optimise(search, 1 + len(at_cities), start, bound, tidy, seconds, iterations, started)
+    optimise(search, 1 + len(at_cities), start, bound, tidy, seconds, iterations, started)
     rest = as_tours(sisr.best_order(search), len(heads))
     return [[remaining[node] for node in tour[2 if head else 1 : -1]] for head, tour in zip(heads, rest, strict=True)]
-
-
-def _optimise(
-    search: sisr.Search,
-    first_unvisited: int,
-    start: np.ndarray | None,
-    bound: float,
-    tidy: bool,
-    seconds: float | None,
-    iterations: int | None,
-    started: float,
-) -> None:
-    """Insert the cities from ``first_unvisited`` on greedily, load the tours ``start`` if they are better, and anneal.
-
-    Cities that are missing in ``start`` are inserted greedily there. ``bound`` is a lower bound on the makespan, at
-    which the search ends.
-    """
-    n = len(search.near)
-    home = np.hypot(search.x[:n] - search.x[0], search.y[:n] - search.y[0])
-    farthest_first = first_unvisited + np.argsort(-home[first_unvisited:], kind="stable")
-    sisr.insert_greedily(search, farthest_first)
-    greedy = best = sisr.sum_lengths(search)
-    if start is not None:
-        inserted = sisr.best_order(search)
-        missing = farthest_first[~np.isin(farthest_first, start)]
-        search.tour[missing] = -1
-        sisr.load_tours(search, start)
-        best = sisr.sum_lengths(search)
-        if len(missing):
-            sisr.insert_greedily(search, missing)
-            best = sisr.sum_lengths(search)
-        if best >= greedy:
-            sisr.load_tours(search, inserted)
-            best = sisr.sum_lengths(search)
-
-    unit, weight, target = greedy * math.sqrt(len(search.length) / n), 0.0, bound + OPTIMALITY_TOLERANCE
-    if tidy:
-        weight, target = sisr.TOTAL_WEIGHT, -math.inf
-        best += weight * float(search.length.sum())
-    if seconds is None and iterations is None:
-        iterations = ITERATIONS_PER_NODE * n
-    _anneal(search, best, target, weight, unit, seconds, iterations, started)
-
-
-def _anneal(
-    search: sisr.Search,
-    best: float,
-    target: float,
-    weight: float,
-    unit: float,
-    seconds: float | None,
-    iterations: int | None,
-    started: float,
-) -> None:
-    """Anneal in rounds until ``seconds`` after ``started``, or for ``iterations``.
-
-    Temperatures are in units of ``unit``, a length; ``best``, ``target`` and ``weight`` are those of ``sisr.anneal``.
-    """
-    if iterations == 0:
-        return
-    seconds = math.inf if seconds is None else seconds
-    limit = 2**62 if iterations is None else iterations
-    turn_seconds = max(seconds / 100, MIN_TURN_SECONDS)  # a kernel does not see the clock, so it is called in turns
-    per_iteration, done, now = FIRST_GUESS + FIRST_GUESS_PER_AGENT * len(search.length), 0, time.perf_counter()
-
-    def progress(now: float, done: int) -> float:  # the fraction of the search that is over
-        return max((now - started) / seconds, done / limit)
-
-    for begin, end in itertools.pairwise(ROUNDS):
-        sisr.load_tours(search, sisr.best_order(search))
-        while best > target and (turn_begin := progress(now, done)) < end:
-            turn = min(turn_seconds, started + end * seconds - now) / per_iteration
-            turn = int(max(min(turn, math.ceil(end * limit) - done), 1))
-            turn_end = min(progress(now + turn * per_iteration, done + turn), end)
-            hot, cold = (
-                START_TEMPERATURE * (END_TEMPERATURE / START_TEMPERATURE) ** ((p - begin) / (end - begin))
-                for p in (turn_begin, turn_end)
-            )
-            best = sisr.anneal(search, turn, hot * unit, cold * unit, best, target, weight)
-            before, now = now, time.perf_counter()
-            per_iteration = max((now - before) / turn, 1e-7)  # a coarse clock may not have moved
-            done += turn
