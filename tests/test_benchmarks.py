@@ -150,6 +150,7 @@ def test_the_search_improves_and_the_check_counts_what_is_proved(tmp_path):
     assert best_known.verify(CELL, 8, tmp_path) == "8x2: 0 of 3 instances, 0 at the lower bound"
 
 
+@pytest.mark.slow
 def test_the_kept_best_known_tours_solve_their_instances():
     kept = best_known.kept_cells()
     assert {cell.label for cell, seed in kept if seed == SEED} >= {"50x5", "100x10"}
@@ -268,6 +269,7 @@ def test_every_speed_is_measured():
         speed.main(device="tpu")
 
 
+@pytest.mark.slow
 def test_the_speed_of_training_counts_what_is_done():
     """FLOP per decision depend on the network alone: a decision that is learnt from takes one forward pass and
     a backward pass of twice the cost; REINFORCE also plays it."""

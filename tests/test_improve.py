@@ -84,6 +84,7 @@ def test_both_networks_improve_without_a_teacher(policy):
     assert all(np.isfinite(log["loss"]) for log in logs)
 
 
+@pytest.mark.slow
 def test_resume_is_bit_identical(tmp_path, monkeypatch):
     improve(replace(TINY, out=tmp_path / "whole"))
 

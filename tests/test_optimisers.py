@@ -115,6 +115,7 @@ def test_muon_needs_hidden_layers():
         make_optimiser("muon", nn.Linear(2, 2), 0.01, 0.0)
 
 
+@pytest.mark.slow
 def test_imitation_with_muon_resumes_bit_for_bit(tmp_path, monkeypatch):
     muon = replace(TINY, optimiser="muon")
     imitate(replace(muon, out=tmp_path / "whole"))

@@ -416,6 +416,7 @@ def process_state():
     )
 
 
+@pytest.mark.slow
 def test_eight_threads_plan_what_one_does_and_change_nothing(network):
     """Sampling, augmentation and greedy games, shipped weights, networks, actors and functions, all at once."""
     instances = [uniform(np.random.default_rng(k), 12 + k, 3) for k in range(3)]

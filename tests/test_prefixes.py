@@ -66,6 +66,7 @@ def test_tours_begin_with_the_prefixes_and_are_never_made_worse(case: tuple, ite
 
 @given(teams_under_way(max_nodes=7))
 @settings(max_examples=60, deadline=None)
+@pytest.mark.slow
 def test_small_instances_are_completed_optimally(case: tuple) -> None:
     instance, prefixes, _ = case
     tours = improve(instance, iterations=2000, prefixes=prefixes)

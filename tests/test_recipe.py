@@ -156,6 +156,7 @@ def test_mistakes_in_a_recipe_are_named(written, old, new, message):
         read_recipe(written(text.replace(old, new, 1)))
 
 
+@pytest.mark.slow
 def test_stages_follow_one_another_and_are_logged(tiny, tmp_path):
     out = tmp_path / "run"
     recipe(tiny, out)

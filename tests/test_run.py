@@ -33,6 +33,7 @@ def measure(tmp_path, *methods, **options):
     return {row.method.removeprefix("misbehaving:"): row for row in rows.read(tmp_path / "rows.jsonl")}
 
 
+@pytest.mark.slow
 def test_a_run_from_end_to_end(tmp_path, capsys):
     out = tmp_path / "new" / "rows.jsonl"
     command = ["run", "--table", "smoke", "--methods", "reference,misbehaving:proves", "--out", str(out)]

@@ -73,6 +73,7 @@ def is_gone(pid: int) -> bool:
 
 
 @needs_lkh
+@pytest.mark.slow
 def test_three_tiny_instances_are_solved_within_the_time_limit():
     for instance in Cell(8, 2, 3).instances(0):
         start = time.perf_counter()
@@ -173,6 +174,7 @@ def test_lkh_is_given_the_instance(stand_in):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux can end a process with its parent")
+@pytest.mark.slow
 def test_lkh_ends_with_a_killed_parent(stand_in):
     seen = stand_in(hangs=True)
     code = (
