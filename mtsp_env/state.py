@@ -103,9 +103,7 @@ class State(NamedTuple):
         ArrayField("bool", ("n",), "the global mask M: a city counts once an agent sets off for it, the depot never"),
     ]
     cities_left: Annotated[Array, ArrayField("int64", (), "number of unvisited cities")]
-    visits: Annotated[
-        Array, ArrayField("int32", ("n",), "who visited a city, and in which order; -1: unvisited; see _visit_code")
-    ]
+    visits: Annotated[Array, ArrayField("int32", ("n",), "who visited a city, and in which order; -1: unvisited")]
     destination: Annotated[Array, ArrayField("int64", ("m",), "node at which an agent is or to which it travels")]
     leg: Annotated[Array, ArrayField("float64", ("m",), "announced time of its current leg and of the visit after it")]
     departed: Annotated[Array, ArrayField("int64", ("m",), "tick at which it set off on that leg")]
