@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto  # one thread each: they share the cores
 INSTALL := $(PIP) install --quiet --constraint constraints.txt
 
 .PHONY: demo test test-fast fuzz lint types wheel docs clean
@@ -14,11 +15,11 @@ demo: $(VENV)/.demo
 # The whole test suite on all cores; lists the lines of mtsp_env and dan_policy that no test runs, and fails if more than 5 %
 # are missed.
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest --numprocesses auto --cov --cov-report=term
+	$(PYTEST) --cov --cov-report=term
 
 # The quick tests alone, on all cores: about two minutes on two cores.
 test-fast: $(VENV)/.dev
-	$(BIN)/python -m pytest -m "not slow and not gpu" --numprocesses auto
+	$(PYTEST) -m "not slow and not gpu"
 
 # 10,000 broken inputs for each reader of files, on all cores; the ordinary tests try 100. Prints counts and times.
 fuzz: $(VENV)/.dev
