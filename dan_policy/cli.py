@@ -128,7 +128,7 @@ def solve(
         samples: with --decode sample: number of games
         augment: play in the eight symmetries of the square and take the best (greedy: eight games instead of one)
         device: cpu, cuda, cuda:1, ...
-        precision: of the network; auto takes bfloat16 if that is faster
+        precision: the network's precision; auto takes bfloat16 if that is faster
         view: agents see at most this many cities, the nearest unvisited ones
         improve: time for which the reference solver improves the policy's tours
         plot: draw the tours: .png, .svg, .pdf, ...

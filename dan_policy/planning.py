@@ -61,12 +61,12 @@ class SolveOptions:
         samples: games to sample, at least 1.
         augment: the games see the instance in the square's eight symmetries in turn, and the best counts (Kwon et al.
             2020, POMO): "greedy" plays eight games instead of one, "sample" as many as without.
-        seed: of the samples and of the improvement, from 0 to 2^63 - 1. The same call gives the same tours on the same
-            machine, except with ``improve``, which goes by the clock.
+        seed: seed of the samples and of the improvement, from 0 to 2^63 - 1. The same call gives the same tours on the
+            same machine, except with ``improve``, which goes by the clock.
         device: None takes a GPU if there is one.
         improve: seconds, above 0, for which ``mtsp_env.reference.improve`` continues from the policy's tours; it never
             makes them worse (extra ``reference``). None leaves the tours as they are.
-        precision: of the network's matrix products. "auto" takes "bfloat16" if the network supports it and
+        precision: precision of the network's matrix products. "auto" takes "bfloat16" if the network supports it and
             ``heuristics.bfloat16_pays`` (about twice as fast for 64 samples on CPUs with AMX or AVX-512 BF16, equally
             good tours), else "float32", whose tours do not depend on the hardware.
         clip: C to sample with, above 0: the larger it is, the more often the likelier actions are drawn. None:

@@ -15,8 +15,9 @@ from mtsp_env.checks import check_count
 
 T = TypeVar("T")
 LEAST_SECONDS = 0.005  # a plan that would get less time than this is not begun
-MARGIN, GREATEST_MARGIN = 0.2, 0.05  # of the time until a deadline, and seconds: to hand the result over
-USED = 0.8  # of the share of a plan is for the search: its preparation of a search does not look at the clock
+MARGIN = 0.2  # share of the time until a deadline that is kept for handing the result over, but at most
+GREATEST_MARGIN = 0.05  # seconds
+USED = 0.8  # share of a plan's time that the search gets; the rest is for its preparation, which ignores the clock
 
 
 class Overloaded(Exception):

@@ -62,7 +62,7 @@ class BatchedMTSP(EnvBase):
         batch_size: B or [B].
         device: where the games live, "cpu" or "cuda". None: on the CPU, in TensorDicts without a device, which TorchRL
             makes a little faster.
-        seed: of the instances; a row's instance depends on the order of resets alone.
+        seed: seed of the instances; a row's instance depends on the order of resets alone.
         check_actions: raise ValueError on an illegal action. On a GPU this waits for the device at each step: switch it
             off if the policy is masked.
         compile: True, or a dict of options of ``torch.compile``: TorchRL then calls ``compile``. Not worth it on a CPU,

@@ -315,7 +315,7 @@ class raw_env(AECEnv):
     def log(self) -> Log:
         """Every agent's legs so far, in units of time; see ``mtsp_env.tours.Leg`` and ``check_log``.
 
-        A leg under way is in it as if nothing came between. Once the episode is over, the return legs are in it, too.
+        It shows a leg under way as if nothing will interrupt it. After the episode it also contains the return legs.
         """
         return write_log(batch([self.instance]), self.rules, self._decisions, self._is_over)
 

@@ -39,8 +39,8 @@ class Picture:
     Args:
         ax: where to draw.
         instance: the problem.
-        longest: of the lengths that will be shown, in the instance's units: all have the decimals that it needs, so
-            that the numbers of an animation do not change their form. 0: as the lengths shown need.
+        longest: the longest length that will be shown, in the instance's units. All lengths get the decimals that it
+            needs, so that the numbers of an animation keep their form. 0: each picture decides by its own lengths.
     """
 
     def __init__(self, ax: Axes, instance: Instance, longest: float = 0.0):

@@ -55,10 +55,11 @@ class Replanner:
     It needs to know everything that anybody knows, and so plays no games with ``view`` or ``hearing``.
 
     Args:
-        milliseconds: of each search, above 0. A search at an event is not cut short before its greedy insertion.
+        milliseconds: time limit of each search, above 0. The greedy insertion with which a search begins is never cut
+            short.
         iterations: limit on the iterations of each search, at least 0. Without ``milliseconds``, decisions depend on
             the games alone.
-        seed: of each search, a whole number of at least 0.
+        seed: seed of each search, a whole number of at least 0.
 
     Raises:
         ValueError: neither milliseconds nor iterations, or a value outside its range.

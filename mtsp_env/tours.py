@@ -49,7 +49,7 @@ def tour_times(instance: Instance, tours: Sequence[Sequence[int]]) -> np.ndarray
     """How long each tour takes, one tour per agent, visits included: float64 (m,). If plain, the same as its length.
 
     Raises:
-        ValueError: a world with ``appears`` or ``breaks``, where the times of departure count, too.
+        ValueError: a world with ``appears`` or ``breaks``, whose makespan also depends on when agents depart.
     """
     if instance.world == ():
         return path_lengths(instance.nodes, tours)

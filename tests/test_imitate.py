@@ -1,15 +1,16 @@
 """Demonstrations are the teacher's tours in one canonical form; learning from them lowers costs and resumes bit for
 bit."""
 
-import signal
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import tiny
 import torch
 from helpers.states import same
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tiny import TINY_PLANS, interrupt_after
 
 from dan_policy import DAN, DANConfig, load, save
 from dan_policy.episode import rollout
@@ -20,32 +21,15 @@ from train.__main__ import main
 from train.baseline import better
 from train.buffer import Buffer
 from train.collect import costs, environment, play
-from train.config import ImitateConfig
 from train.demonstrations import Demonstrations, as_decisions, as_links, canonical, demonstrate, follow
 from train.imitate import ImitationLearner, imitate
 from train.supervised import rate
+from train.supervised_config import ImitateConfig
 
 pytest.importorskip("numba", reason="the teacher is compiled with Numba")
 
 KEYS = ("cities", "agents", "visited", "action_mask")
-TINY = ImitateConfig(
-    n_nodes=(6, 9),
-    n_agents=(1, 3),
-    nodes_per_agent=2,
-    network=DANConfig(embed_dim=16, feedforward_dim=32, n_heads=2, city_layers=1, prune_visited=True),
-    set_tokens=100,
-    buffer=3,
-    sets_per_step=2,
-    workers=0,
-    teacher_iterations=20,
-    warmup=2,
-    steps=24,
-    average=0.5,
-    validate_every=4,
-    validation_instances=8,
-    checkpoint_every=4,
-    tensorboard=False,
-)
+TINY = replace(TINY_PLANS, policy="dan", joint=ImitateConfig().joint, network=tiny.TINY.network, steps=24)
 
 
 @st.composite
@@ -225,14 +209,7 @@ def test_the_learning_rate_warms_up_and_falls_to_its_end():
 def test_resume_is_bit_identical(tmp_path, monkeypatch, student):
     imitate(replace(student, out=tmp_path / "whole"))
 
-    def interrupted(self):
-        logs = train_step(self)
-        if self.step == 7:
-            signal.raise_signal(signal.SIGINT)
-        return logs
-
-    train_step = ImitationLearner.train_step
-    monkeypatch.setattr(ImitationLearner, "train_step", interrupted)
+    interrupt_after(7, ImitationLearner, monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         imitate(replace(student, out=tmp_path / "parts"))
     assert checkpoint.read(tmp_path / "parts" / "checkpoint.pt")["progress"]["step"] == 7

@@ -1,13 +1,12 @@
 """Self-improvement learns from the best of the policy's own games, lowers costs and resumes bit for bit."""
 
-import signal
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from helpers.states import same
-from tiny import TINY_PLANS
+from tiny import TINY_PLANS, interrupt_after
 
 from dan_policy.episode import rollout
 from dan_policy.joint import JointConfig, JointDAN
@@ -18,9 +17,9 @@ from train import checkpoint
 from train.__main__ import main
 from train.baseline import better
 from train.collect import costs, draw, draw_set, environment, play, repeat, rotated
-from train.config import ImproveConfig
 from train.demonstrations import demonstrate, follow
 from train.improve import ImproveLearner, best_games, improve
+from train.supervised_config import ImproveConfig
 
 TINY = ImproveConfig(
     policy="joint",
@@ -88,14 +87,7 @@ def test_both_networks_improve_without_a_teacher(policy):
 def test_resume_is_bit_identical(tmp_path, monkeypatch):
     improve(replace(TINY, out=tmp_path / "whole"))
 
-    def interrupted(self):
-        logs = train_step(self)
-        if self.step == 3:
-            signal.raise_signal(signal.SIGINT)
-        return logs
-
-    train_step = ImproveLearner.train_step
-    monkeypatch.setattr(ImproveLearner, "train_step", interrupted)
+    interrupt_after(3, ImproveLearner, monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         improve(replace(TINY, out=tmp_path / "parts"))
     assert checkpoint.read(tmp_path / "parts" / "checkpoint.pt")["progress"]["step"] == 3

@@ -13,8 +13,8 @@ from benchmarks import best_known
 from benchmarks.policies import nearest
 from benchmarks.studies import ablations, curves
 from benchmarks.suite import SEED, Cell
-from train.config import ImitateConfig
 from train.presets import QUICK, REFINE
+from train.supervised_config import ImitateConfig
 
 CELL = Cell(50, 5, 3)
 

@@ -2,13 +2,13 @@
 bit."""
 
 import copy
-import signal
 from dataclasses import replace
 
 import pytest
 import torch
 from helpers.states import same
 from tiny import TINY_PLANS as TINY
+from tiny import interrupt_after
 from torch import nn
 from torch.optim.lr_scheduler import LambdaLR
 
@@ -120,14 +120,7 @@ def test_imitation_with_muon_resumes_bit_for_bit(tmp_path, monkeypatch):
     muon = replace(TINY, optimiser="muon")
     imitate(replace(muon, out=tmp_path / "whole"))
 
-    def interrupted(self):
-        logs = train_step(self)
-        if self.step == 5:
-            signal.raise_signal(signal.SIGINT)
-        return logs
-
-    train_step = ImitationLearner.train_step
-    monkeypatch.setattr(ImitationLearner, "train_step", interrupted)
+    interrupt_after(5, ImitationLearner, monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         imitate(replace(muon, out=tmp_path / "parts"))
     monkeypatch.undo()

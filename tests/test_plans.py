@@ -1,7 +1,6 @@
 """The teacher's plan labels every agent and every city; networks learn from it, and resume bit for bit."""
 
 import math
-import signal
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +8,7 @@ import pytest
 import torch
 from helpers.states import same
 from tiny import TINY_PLANS as TINY
+from tiny import interrupt_after
 
 from dan_policy.dan import DAN, DANConfig
 from dan_policy.joint import JointDAN
@@ -138,14 +138,7 @@ def test_weights_of_zero_and_networks_without_the_outputs_need_no_plans():
 def test_resume_is_bit_identical(tmp_path, monkeypatch):
     imitate(replace(TINY, out=tmp_path / "whole"))
 
-    def interrupted(self):
-        logs = train_step(self)
-        if self.step == 5:
-            signal.raise_signal(signal.SIGINT)
-        return logs
-
-    train_step = ImitationLearner.train_step
-    monkeypatch.setattr(ImitationLearner, "train_step", interrupted)
+    interrupt_after(5, ImitationLearner, monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         imitate(replace(TINY, out=tmp_path / "parts"))
     assert checkpoint.read(tmp_path / "parts" / "checkpoint.pt")["progress"]["step"] == 5

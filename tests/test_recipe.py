@@ -14,13 +14,14 @@ from dan_policy.joint import JointConfig, JointDAN
 from dan_policy.registry import load_extra
 from train import checkpoint
 from train.__main__ import main
-from train.config import ImitateConfig, ImproveConfig, ReinforceConfig
 from train.imitate import ImitationLearner
 from train.improve import ImproveLearner
 from train.presets import REFINE
 from train.recipe import PREVIOUS, UNLIMITED, read_recipe
 from train.reinforce import ReinforceLearner
+from train.reinforce_config import ReinforceConfig
 from train.stages import recipe
+from train.supervised_config import ImitateConfig, ImproveConfig
 
 pytest.importorskip("numba", reason="the teacher is compiled with Numba")
 

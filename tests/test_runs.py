@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 from helpers.states import same
-from tiny import TINY
+from tiny import TINY, interrupt_after
 
 from benchmarks.policies.attention_model import AttentionModel
 from dan_policy import load
 from train import checkpoint
 from train.__main__ import main
 from train.checkpoint import check_same_run
-from train.config import ReinforceConfig
 from train.reinforce import ReinforceLearner, reinforce
+from train.reinforce_config import ReinforceConfig
 
 
 @pytest.mark.parametrize("average", [0.0, 0.9])
@@ -35,14 +35,7 @@ def test_resume_is_bit_identical(tmp_path, average):
 
 
 def test_an_interrupt_finishes_the_step_and_saves(tmp_path, monkeypatch):
-    def step_then_interrupt(self):
-        logs = train_step(self)
-        if self.step == 3:
-            signal.raise_signal(signal.SIGINT)
-        return logs
-
-    train_step = ReinforceLearner.train_step
-    monkeypatch.setattr(ReinforceLearner, "train_step", step_then_interrupt)
+    interrupt_after(3, ReinforceLearner, monkeypatch)
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):  # raised again, once everything is saved
         reinforce(replace(TINY, out=tmp_path, checkpoint_every=1000))

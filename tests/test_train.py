@@ -18,10 +18,10 @@ from train import checkpoint
 from train.__main__ import main
 from train.baseline import RolloutBaseline, SharedBaseline, better
 from train.collect import costs, draw, draw_set, play, repeat
-from train.config import ReinforceConfig
 from train.loss import EpisodicReinforceLoss, backward, decisions_with_advantage, log_probs, subsample
 from train.presets import PAPER
 from train.reinforce import ReinforceLearner, reinforce
+from train.reinforce_config import ReinforceConfig
 
 
 class Preferences(nn.Module):

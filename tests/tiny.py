@@ -1,10 +1,14 @@
-"""The options of training runs that take a second."""
+"""The options of training runs that take a second, and how to interrupt one."""
 
+import signal
 from dataclasses import replace
 
+import pytest
+
 from dan_policy import DANConfig, JointConfig
-from train.config import ImitateConfig
+from train.learner import Learner
 from train.presets import QUICK
+from train.supervised_config import ImitateConfig
 
 TINY = replace(
     QUICK,
@@ -42,3 +46,16 @@ TINY_PLANS = ImitateConfig(
     checkpoint_every=4,
     tensorboard=False,
 )
+
+
+def interrupt_after(step: int, learner: type[Learner], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Send SIGINT after this step of every run of a learner, until ``monkeypatch.undo()``."""
+    train_step = learner.train_step
+
+    def interrupted(self: Learner) -> dict[str, float]:
+        logs = train_step(self)
+        if self.step == step:
+            signal.raise_signal(signal.SIGINT)
+        return logs
+
+    monkeypatch.setattr(learner, "train_step", interrupted)

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from mtsp_env.instance import Problem
 from train.collect import costs, draw_set, play
-from train.config import ReinforceConfig
 from train.distributed import gather
+from train.reinforce_config import ReinforceConfig
 
 
 class Baseline(Protocol):

@@ -19,9 +19,9 @@ from torch import Tensor
 
 from dan_policy.actor import Key
 from dan_policy.registry import find
-from train.config import ImitateConfig
 from train.demonstrations import Demonstrations, as_decisions, demonstrate
 from train.plans import PLAN_KEYS, add_plans
+from train.supervised_config import ImitateConfig
 
 
 class Buffer:

@@ -26,8 +26,8 @@ from mtsp_env.distributions import sample
 from mtsp_env.instance import Problem, Tours, check_plain
 from mtsp_env.tours import is_closed
 from train.collect import autocast, draw_size, environment, rotated
-from train.config import ImitateConfig, SupervisedConfig
 from train.network import load_student
+from train.supervised_config import ImitateConfig, SupervisedConfig
 
 
 class Demonstrations(NamedTuple):

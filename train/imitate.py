@@ -9,10 +9,10 @@ import tyro
 
 from dan_policy.registry import find
 from train.buffer import Buffer
-from train.config import ImitateConfig
 from train.loop import run, run_folder
 from train.network import observation_keys
 from train.supervised import SupervisedLearner
+from train.supervised_config import ImitateConfig
 
 
 class ImitationLearner(SupervisedLearner):

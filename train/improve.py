@@ -17,12 +17,12 @@ from torch import nn
 from mtsp_env import rules
 from mtsp_env.instance import Problem
 from train.collect import draw, play, repeat, rotated
-from train.config import ImproveConfig
 from train.demonstrations import Demonstrations, as_decisions, as_links
 from train.loop import run, run_folder
 from train.network import observation_keys
 from train.plans import PLAN_KEYS, add_plans
 from train.supervised import SupervisedLearner
+from train.supervised_config import ImproveConfig
 
 
 class ImproveLearner(SupervisedLearner):

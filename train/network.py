@@ -13,7 +13,8 @@ from torch import nn
 from dan_policy.actor import Key, make_actor
 from dan_policy.registry import NETWORKS, build, load, save
 from mtsp_env.batched import BatchedMTSP
-from train.config import ImitateConfig, RunConfig
+from train.config import RunConfig
+from train.supervised_config import ImitateConfig
 
 
 def make_network(config: RunConfig) -> nn.Module:

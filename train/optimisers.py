@@ -26,8 +26,8 @@ def make_optimiser(name: OptimiserName, network: nn.Module, learning_rate: float
     Args:
         name: "adamw", or "muon" for Muon on the matrices of ``HIDDEN_LAYERS`` and AdamW on all other parameters.
         network: the network.
-        learning_rate: of all parameters.
-        weight_decay: of all parameters, decoupled from the gradient.
+        learning_rate: learning rate of all parameters.
+        weight_decay: weight decay of all parameters, decoupled from the gradient.
 
     Raises:
         ValueError: "muon" for a network without hidden layers of these kinds.

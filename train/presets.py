@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from dan_policy.dan import DANConfig
-from train.config import ReinforceConfig
+from train.reinforce_config import ReinforceConfig
 
 PAPER = ReinforceConfig(curriculum=((80_000, 20, 200, 5, 10),))
 """The paper's training (Sec. 5.1), except that the optimiser takes one step per batch instead of one per agent.

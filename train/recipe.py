@@ -4,8 +4,8 @@ A recipe is a TOML file (``train/recipes/``):
 
 - ``[shared]`` holds options of all stages.
 - Each ``[[stages]]`` has a ``name``, the ``command`` that trains (``imitate``, ``reinforce`` or ``improve``), for
-  ``reinforce`` perhaps a ``preset``, and its ``options`` with the names that they have in ``train.config``. Its budget
-  is ``steps``, or ``seconds`` of training and validation in all, or both.
+  ``reinforce`` perhaps a ``preset``, and its ``options``, named as in the command's configuration. Its budget is
+  ``steps``, or ``seconds`` of training and validation in all, or both.
 
 Every stage but the first starts from the best weights of the stage before (``init = "previous"``), which may also play
 the beginnings of its games (``roll_in = "previous"``).
@@ -23,12 +23,14 @@ from typing import Any, NamedTuple
 
 from pydantic import TypeAdapter, ValidationError
 
-from train.config import ImitateConfig, ImproveConfig, ReinforceConfig, RunConfig, SupervisedConfig
+from train.config import RunConfig
 from train.imitate import ImitationLearner
 from train.improve import ImproveLearner
 from train.learner import Learner
 from train.presets import PRESETS
 from train.reinforce import ReinforceLearner
+from train.reinforce_config import ReinforceConfig
+from train.supervised_config import ImitateConfig, ImproveConfig, SupervisedConfig
 
 if sys.version_info >= (3, 11):
     import tomllib

@@ -13,12 +13,12 @@ from dan_policy.episode import Episode
 from mtsp_env.instance import Problem
 from train.baseline import Baseline, RolloutBaseline, SharedBaseline
 from train.collect import autocast, draw, play, repeat
-from train.config import ReinforceConfig
 from train.distributed import average_gradients, processes, world_size
 from train.learner import Learner
 from train.loop import run, run_folder
 from train.loss import EpisodicReinforceLoss, backward, decisions_with_advantage, subsample
 from train.presets import Preset
+from train.reinforce_config import ReinforceConfig
 from train.remote import RayWorkers
 
 

@@ -18,8 +18,8 @@ from dan_policy.episode import Episode, rollout
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.instance import Problem
 from train.collect import draw, draw_size, environment, play, repeat
-from train.config import ReinforceConfig
 from train.network import observation_keys
+from train.reinforce_config import ReinforceConfig
 
 
 class RayWorkers:

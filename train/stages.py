@@ -19,10 +19,11 @@ from dan_policy.registry import find
 from mtsp_env.checks import check_seconds
 from mtsp_env.files import atomic_write, write_json
 from train import checkpoint
-from train.config import ImitateConfig, RunConfig
+from train.config import RunConfig
 from train.learner import Learner, checkpoint_path
 from train.loop import run, run_folder
 from train.recipe import COMMANDS, PREVIOUS, Stage, read_recipe
+from train.supervised_config import ImitateConfig
 
 LOG = "log.json"
 GIVEN = "init.safetensors"  # the copy of the weights that --init names

@@ -13,11 +13,11 @@ from torch import Tensor, nn
 from dan_policy.actor import make_actor, network_keys
 from dan_policy.layers import DenseLogits
 from train.collect import autocast
-from train.config import SupervisedConfig
 from train.learner import Learner
 from train.loss import log_probs
 from train.optimisers import make_optimiser
 from train.plans import match_plans, plan_losses
+from train.supervised_config import SupervisedConfig
 
 
 class SupervisedLearner(Learner):

@@ -31,7 +31,7 @@ def solve(instance: Instance, seconds: float, seed: int, samples: int | None = N
     Args:
         instance: the problem.
         seconds: limit on the time.
-        seed: of the draws.
+        seed: seed of the random allocations.
         samples: number of allocations, the likeliest one included; None: that one alone.
 
     Raises:

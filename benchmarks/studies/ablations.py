@@ -27,11 +27,12 @@ from dan_policy.planning import SPEED
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.tours import makespan
 from train import checkpoint
-from train.config import ImitateConfig, RunConfig
+from train.config import RunConfig
 from train.imitate import imitate
 from train.learner import checkpoint_path
 from train.presets import REFINE
 from train.reinforce import reinforce
+from train.supervised_config import ImitateConfig
 
 RESULTS = Path(__file__).parents[1] / "results"
 CELLS = (Cell(50, 5, 20), Cell(50, 10, 20), Cell(100, 10, 20))  # of Table 1

@@ -17,11 +17,12 @@ from mtsp_env.reference import improve_batch
 from mtsp_env.tours import makespan
 from train import checkpoint
 from train.collect import draw_set
-from train.config import ImitateConfig, RunConfig
+from train.config import RunConfig
 from train.imitate import imitate
 from train.learner import VALIDATION_SEED, checkpoint_path
 from train.presets import QUICK
 from train.reinforce import reinforce
+from train.supervised_config import ImitateConfig
 
 RESULTS = Path(__file__).parents[1] / "results"
 SETTING = {"n_nodes": (20, 20), "n_agents": (3, 3), "nodes_per_agent": 2, "speed": 0.01, "validation_instances": 512}

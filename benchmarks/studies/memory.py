@@ -109,7 +109,7 @@ def main(share: float = 1.0, cases: tuple[str, ...] = tuple(CASES)) -> None:
     """Measure the memory of long processes, and how much it grows.
 
     Args:
-        share: of the usual number of rounds.
+        share: how many rounds to run, as a share of the usual number.
         cases: which to measure.
 
     Raises:

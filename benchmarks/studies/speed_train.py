@@ -15,11 +15,11 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.studies.timing import machine_title, matmul_rate, per_second, wait_for
 from train.collect import draw, play, repeat
-from train.config import ImitateConfig
 from train.demonstrations import demonstrate
 from train.imitate import ImitationLearner
 from train.presets import REFINE
 from train.reinforce import ReinforceLearner
+from train.supervised_config import ImitateConfig
 
 SIZES = ((20, 3), (50, 5), (100, 10), (200, 20))
 TOKENS = 3200  # instances times nodes in a batch
