@@ -23,6 +23,7 @@ COLOURS = (
     *("#5a78ff", "#69d278", "#ffa5b4", "#d22d4b", "#2d2d78", "#691e2d", "#3c4bf0", "#874b69", "#a53c0f", "#4b96f0"),
 )
 UNVISITED = "#8c8c8c"
+BROKEN = "#777777"  # an agent that has broken down
 LEGEND_ROWS = 24  # with more agents, the legend lists only this many of the longest tours
 
 
@@ -94,23 +95,38 @@ class Picture:
             self._set_title(self._summary(lengths))
 
     def update_moment(self, moment: Moment, time: float, end: float) -> None:
-        """Show where a team is at ``time`` of a log that ends at ``end``. A disc marks where each agent is."""
+        """Show where a team is at ``time`` of a log that ends at ``end``.
+
+        A disc marks where each agent is; it is grey if the agent has broken down. Cities are hidden until they appear.
+        """
         over = time >= end  # until then, all agents of one speed have driven equally far
         longest = int(moment.lengths.argmax()) if over and moment.lengths.any() else None
-        self._show(moment.paths, moment.lengths, moment.owner, longest)
+        appears, breaks = self.instance.appears, self.instance.breaks
+        known = np.ones(len(moment.owner), bool) if appears is None else appears <= time
+        self._show(moment.paths, moment.lengths, moment.owner, longest, known)
         positions = np.array([path[-1] for path in moment.paths])
-        self.heads.set(offsets=positions, facecolor=self.colours, edgecolor="white")
+        broken = np.zeros(len(positions), bool) if breaks is None else breaks <= time
+        colours = np.where(broken[:, None], _rgba(BROKEN), self.colours)
+        self.heads.set(offsets=positions, facecolor=colours, edgecolor="white")
         if over and math.isclose(moment.lengths.max(), end):  # nobody has waited: the time is the makespan
             self._set_title(self._summary(moment.lengths))
             return
         now = format_lengths([time * self.instance.scale, end * self.instance.scale])[0]
         reached = int((moment.owner[1:] >= 0).sum())
-        self._set_title(f"time {now}, {reached} of {len(moment.owner) - 1} cities")
+        cities = f"{len(moment.owner) - 1} cities" if appears is None else f"{int(known[1:].sum())} known cities"
+        self._set_title(f"time {now}, {reached} of {cities}")
 
-    def _show(self, paths: Sequence[np.ndarray], lengths: np.ndarray, owner: np.ndarray, longest: int | None) -> None:
+    def _show(
+        self,
+        paths: Sequence[np.ndarray],
+        lengths: np.ndarray,
+        owner: np.ndarray,
+        longest: int | None,
+        known: np.ndarray | None = None,
+    ) -> None:
         """Move the lines to ``paths``, (k, 2) each; colour the cities by ``owner`` (n,); list ``lengths`` (m,).
 
-        The line and the length of agent ``longest`` are bold.
+        The line and the length of agent ``longest`` are bold. Cities that are not ``known`` (n,) are hidden.
         """
         for agent, (line, path) in enumerate(zip(self.lines, paths, strict=True)):
             line.set_data(*path.T)
@@ -119,6 +135,7 @@ class Picture:
         self.cities.set(
             facecolor=np.where(visited, self.colours[owner[1:]], _rgba("white")),
             edgecolor=np.where(visited, _rgba("white"), _rgba(UNVISITED)),
+            alpha=None if known is None else known[1:].astype(float),
         )
         self._update_legend(lengths, self._labels(lengths), longest)
 

@@ -131,3 +131,16 @@ def test_a_missing_package_is_named(monkeypatch, module: str, name: str, extra: 
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(ImportError, match=rf'pip install "mtsp-env\[{extra}\]"'):
         check_animation_suffix(name)
+
+
+def test_cities_are_hidden_until_they_appear_and_broken_agents_are_grey(square) -> None:
+    world = Instance(square.nodes, 2, appears=[0, 0, 0, 0, 0, 3.0, 0], breaks=[np.inf, 1.0])
+    log = [[(1, 0.0, 0.75, 0.75)], [(4, 0.0, 0.5, 0.5)]]
+    picture = Picture(new_figure((4.0, 4.0)).add_axes((0.0, 0.0, 1.0, 1.0)), world)
+    for time, hidden, is_grey in ((0.5, {5}, False), (2.0, {5}, True), (3.0, set(), True)):
+        picture.update_moment(moment(world, make_log(world, log=log), time), time, end=4.0)
+        alpha = picture.cities.get_facecolor()[:, 3]
+        assert {city for city in range(1, 7) if alpha[city - 1] == 0.0} == hidden
+        red, green, blue, _ = picture.heads.get_facecolor()[1]
+        assert (red == green == blue) == is_grey
+        assert picture.ax.get_title().endswith(f"of {6 - len(hidden)} known cities")
