@@ -43,9 +43,9 @@ def _within_triangulation(nodes: np.ndarray) -> float:
 
     try:
         triangles = Delaunay(nodes).simplices.astype(np.int64)  # (t, 3)
-    except QhullError:  # all nodes lie on a line: the tree joins its ends
-        in_order = nodes[np.lexsort(nodes.T)]
-        return float(np.linalg.norm(in_order[-1] - in_order[0]))
+    except QhullError:  # all nodes lie on a line, as far as its rounding can tell: the tree joins the line's ends
+        along = nodes[:, np.ptp(nodes, axis=0).argmax()]
+        return float(np.linalg.norm(nodes[along.argmax()] - nodes[along.argmin()]))
     sides = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     a, b = np.divmod(np.unique(sides[:, 0] * len(nodes) + sides[:, 1]), len(nodes))  # each side once
     length = np.linalg.norm(nodes[a] - nodes[b], axis=1)
