@@ -21,6 +21,8 @@ COMMANDS = {
     "optima": "benchmarks.studies.optima:main",
     "libraries": "benchmarks.studies.libraries:main",
     "speed": "benchmarks.studies.speed:main",
+    "leaderboard": "benchmarks.leaderboard.board:leaderboard",
+    "submit": "benchmarks.leaderboard.submit:submit",
     "memory": "benchmarks.studies.memory:main",
     "sweep-clip": "benchmarks.studies.sweeps:sweep_clip",
     "sweep-view": "benchmarks.studies.sweeps:sweep_view",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -154,7 +154,12 @@ def load(files: Sequence[Path], tsplib: Path | None = None, folder: Path = best_
         OSError: a file cannot be read.
         ValueError: as ``judge.read_judged``.
     """
-    latest = {row.key: row for row in read_judged(files, tsplib)}
+    return collect(read_judged(files, tsplib), tsplib, folder)
+
+
+def collect(judged: Iterable[Row], tsplib: Path | None = None, folder: Path = best_known.FOLDER) -> list[Results]:
+    """The results of judged rows, one for each table. Arguments as for ``load``."""
+    latest = {row.key: row for row in judged}
     by_table = {table: [row for row in latest.values() if row.table == table] for table in TABLES}
     return [_results(table, rows, tsplib, folder) for table, rows in by_table.items() if rows]
 

@@ -193,7 +193,7 @@ def _gaps(results: Results, notes: Notes) -> str:
         ]
         all_gaps = [gap for gaps in by_cell for gap in gaps]
         lines.append((label, [*columns, f"{_number(mean(all_gaps), '.2f')} ({len(all_gaps)})"]))
-    lines = [*_published_gaps(results), *lines, _bound_gaps(results)]
+    lines = [*published_gaps(results), *lines, _bound_gaps(results)]
     total = sum(len(results.instances(cell.label)) for cell in results.cells)
     return _table(results, lines, f"all ({total})")
 
@@ -209,7 +209,7 @@ def _bound_gaps(results: Results) -> Line:
     return BOUND, [*columns, f"{_number(mean(every), '.2f')} ({len(every)})"]
 
 
-def _published_gaps(results: Results) -> list[Line]:
+def published_gaps(results: Results) -> list[Line]:
     """For the public test set: published means against the mean best known makespan of the same 100 instances."""
     lines = []
     for name, columns in _published(results, "cost", ".8g").items() if results.public_best else ():
