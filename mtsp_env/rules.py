@@ -98,7 +98,6 @@ def start(problem: Problem, rules: Rules) -> State:
         departed=zeros(batch, n_agents),
         ready=zeros(batch, n_agents),
         own_time=zeros(batch, n_agents, dtype=xp.float64),
-        closed=zeros(batch),
         decisions=zeros(batch),
     )
     if problem.is_plain:
@@ -149,7 +148,7 @@ def _legal(state: State, rules: Rules, tick: Array, here: Array, known: Array | 
         mask = mask & known
         nothing_open = ~library(mask)[0].any(mask[:, 1:], axis=1)
     if rules.depot == "final":
-        depot = (here != 0) & (state.closed < state.ready.shape[1] - 1)
+        depot = (here != 0) & ((state.ready < NEVER).sum(1) > 1)
     else:
         away = (state.destination != 0) | ((state.leg > 0) & (state.ready > tick[:, None]))
         depot = (away if state.alive is None else away & state.alive).any(1)
@@ -229,9 +228,8 @@ def depart(state: State, rules: Rules, action: Array, agent: Array | None = None
         own_time = world.leaves_at(state, rules, own, is_city & from_depot, tick) + times.total
         world_fields = world.note_leg(state, rules, own, is_city | ~from_depot, tick, times)
 
-    closed = state.closed
     if rules.depot == "final":
-        ready, closed = library(ready)[0].where(is_city, ready, NEVER), closed + ~is_city
+        ready = library(ready)[0].where(is_city, ready, NEVER)
     elif rules.depot == "wait":
         ready = library(ready)[0].where(is_city | ~from_depot, ready, NEVER)  # until something happens
     after = State(
@@ -245,7 +243,6 @@ def depart(state: State, rules: Rules, action: Array, agent: Array | None = None
         departed=put(state.departed, own, tick),
         ready=put(state.ready, own, ready),
         own_time=put(state.own_time, own, own_time),
-        closed=closed,
         decisions=state.decisions + 1,
         **world_fields,
     )

@@ -113,7 +113,6 @@ class State(NamedTuple):
     own_time: Annotated[
         Array, ArrayField("float64", ("m",), "its own time after the current leg; if plain, its tour's length so far")
     ]
-    closed: Annotated[Array, ArrayField("int64", (), 'number of agents whose tour is closed (depot "final")')]
     decisions: Annotated[Array, ArrayField("int64", (), "decisions made so far")]
     legs: Annotated[Array, ArrayField("int64", ("m",), "number of legs that it has begun", needs="traffic")] = None
     appear_tick: Annotated[
