@@ -27,6 +27,7 @@ COMMANDS = {
     "sweep-clip": "benchmarks.studies.sweeps:sweep_clip",
     "sweep-view": "benchmarks.studies.sweeps:sweep_view",
     "ablations": "benchmarks.studies.ablations:main",
+    "worlds": "benchmarks.studies.worlds:main",
     "curves": "benchmarks.studies.curves:main",
 }
 

@@ -18,10 +18,13 @@ from torch import Tensor
 from dan_policy.actor import Key, Network, check_greatest, network_keys
 from dan_policy.symmetry import views
 from mtsp_env import rules
-from mtsp_env.instance import Instance, Problem, Tours, batch
+from mtsp_env.instance import Array, Instance, Problem, Tours, batch
 
 Logits = Callable[[rules.State, rules.Observation], Tensor]
 """What the deciding agents see, and the state of their games -> logits (B, n)."""
+
+Choose = Callable[[rules.State, rules.Observation], Array]
+"""The same -> actions (B,), each legal."""
 
 
 def begin(
@@ -73,12 +76,27 @@ def play(
         generator: on the state's device; actions are drawn from it. None takes the likeliest actions.
 
     Raises:
-        ValueError: a policy that reads unknown keys, whose logits have a wrong shape or are not numbers, or that writes
-            an illegal action.
+        ValueError: as ``chooser`` says.
+    """
+    choose = chooser(policy, generator)
+    while not rules.terminated(state).all():
+        state = rules.depart(state, game, choose(state, rules.observe(state, game)))
+    return state
+
+
+def chooser(policy: Network | TensorDictModuleBase, generator: torch.Generator | None = None) -> Choose:
+    """A policy as a function of the state of B games and of what their deciding agents see.
+
+    It returns legal actions (B,), as a NumPy array if the games are made of NumPy arrays. Arguments as for ``play``.
+
+    Raises:
+        ValueError: when it is called: a policy that reads unknown keys, whose logits have a wrong shape or are not
+            numbers, or that writes an illegal action.
     """
     logits_of = _logits_of(policy)
-    while not rules.terminated(state).all():
-        seen = rules.observe(state, game)
+
+    @torch.no_grad()
+    def choose(state: rules.State, seen: rules.Observation) -> Array:
         mask = torch.as_tensor(seen.action_mask)
         logits = logits_of(state, seen)
         if logits.shape != mask.shape:
@@ -90,8 +108,9 @@ def play(
             raise ValueError("the policy's logits must be finite for at least one legal node, got -inf for all of them")
         if generator is not None:
             action = torch.multinomial(logits.float().softmax(1), 1, generator=generator)[:, 0]
-        state = rules.depart(state, game, action.numpy() if isinstance(state.ready, np.ndarray) else action)
-    return state
+        return action.numpy() if isinstance(state.ready, np.ndarray) else action
+
+    return choose
 
 
 def best_tours(state: rules.State) -> Tours:

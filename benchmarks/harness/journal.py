@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
-from benchmarks.harness.rows import Row, parse_lines
+from benchmarks.harness.rows import parse_lines
 from mtsp_env.writing import lock
 
 
@@ -16,12 +18,16 @@ class Journal:
 
     A last line that was cut off when its writer was killed is dropped. A lock on the file allows one writer at a time.
 
+    Args:
+        path: the file.
+        parse: reads its lines, ``(path, data) -> rows``, and raises ValueError on a damaged one. Rows are dataclasses.
+
     Raises:
         OSError: the file cannot be written.
         ValueError: a damaged line before the last, a gzipped file, a device or pipe, or another writer.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, parse: Callable[[Path, bytes], Iterator[Any]] = parse_lines) -> None:
         if path.exists() and not path.is_file():
             raise ValueError(f"{path}: rows are appended to regular files only")
         if path.suffix == ".gz":
@@ -33,7 +39,7 @@ class Journal:
             self._file.seek(0)
             whole_lines = self._file.read().rpartition(b"\n")[0]
             self._file.truncate(len(whole_lines) + 1 if whole_lines else 0)
-            self.rows = list(parse_lines(path, whole_lines))
+            self.rows = list(parse(path, whole_lines))
         except BlockingIOError:
             self._file.close()
             raise ValueError(f"{path}: another run is writing to it") from None
@@ -41,7 +47,7 @@ class Journal:
             self._file.close()
             raise
 
-    def append(self, row: Row) -> None:
+    def append(self, row: Any) -> None:
         """Append a row; it is on the disk when this returns."""
         self._file.write(json.dumps(asdict(row), separators=(",", ":")).encode() + b"\n")
         self._file.flush()
