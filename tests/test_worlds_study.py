@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from benchmarks.__main__ import main
+from benchmarks.harness.world_rows import Row, parse_lines
+from benchmarks.policies.in_worlds import METHODS, find_method
 from benchmarks.studies import worlds
-from benchmarks.studies.worlds import Cell, Row, judge, parse_lines, play, play_together
+from benchmarks.studies.worlds import Cell, judge, play, play_together
 from dan_policy import load
 from dan_policy.games import chooser
 from mtsp_env import Instance, makespan, mtsp_v0, rules
@@ -42,7 +44,7 @@ def test_a_games_makespan_is_that_of_the_environment(scenario: str) -> None:
     cell = Cell(scenario, 9, 3)
     env = mtsp_v0.env(n_nodes=9, n_agents=3, scenario=scenario, depot="wait")
     for number in range(4):
-        decisions, seconds = play(cell.instance(number), cell.rules, worlds.METHODS["nearest"].rule(None))
+        decisions, seconds = play(cell.instance(number), cell.rules, METHODS["nearest"].rule(None))
         assert seconds > 0
         env.reset(options={"instance": cell.instance(number)})
         for node in decisions:
@@ -55,7 +57,7 @@ def test_a_games_makespan_is_that_of_the_environment(scenario: str) -> None:
 def test_a_game_that_is_cut_off_costs_the_penalty() -> None:
     instance = Cell("plain", 5, 2).instance(0)
     short = rules.make_rules(5, 2, 0.01, "wait", "sparse", 2)
-    decisions, _ = play(instance, short, worlds.METHODS["nearest"].rule(None))
+    decisions, _ = play(instance, short, METHODS["nearest"].rule(None))
     cost, truncated = judge(instance, short, decisions)
     assert truncated and len(decisions) == 2
     trips = 2 * np.linalg.norm(instance.nodes - instance.nodes[0], axis=1)
@@ -201,5 +203,5 @@ def test_damaged_rows_are_named(line: bytes, tmp_path: Path) -> None:
 
 
 def test_a_network_of_ones_own_is_a_method() -> None:
-    own = worlds.find_method("runs/mine.safetensors")
-    assert own == replace(worlds.METHODS["joint"], title="`runs/mine.safetensors`, greedy", network=own.network)
+    own = find_method("runs/mine.safetensors")
+    assert own == replace(METHODS["joint"], title="`runs/mine.safetensors`, greedy", network=own.network)

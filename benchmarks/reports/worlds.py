@@ -10,9 +10,10 @@ from matplotlib.figure import Figure
 from scipy.stats import sem
 
 from benchmarks.files import write_text
+from benchmarks.harness.world_rows import Row, parse_lines
+from benchmarks.policies.in_worlds import BASELINE, METHODS, find_method
 from benchmarks.reports.markdown import markdown_table
 from benchmarks.reports.plots import OTHER, STYLE, save
-from benchmarks.studies.worlds import BASELINE, METHODS, Row, find_method, parse_lines
 from mtsp_env import SCENARIOS
 from mtsp_env.reading import read_file
 

@@ -9,23 +9,22 @@ the process's own CPU, with one thread, so that other work on the machine distur
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
 
-import msgspec
 import numpy as np
 import torch
-from msgspec import Meta
 from rich.progress import track
 
 from benchmarks.harness.journal import Journal
 from benchmarks.harness.machine import describe_machine
+from benchmarks.harness.world_rows import Row, parse_lines
+from benchmarks.policies.in_worlds import METHODS, Decide, find_method, is_available
 from benchmarks.policies.plan_once import PlanOnce
+from benchmarks.reports.worlds import write_report
 from dan_policy import load, registry
 from dan_policy.games import Choose, chooser
 from mtsp_env import SCENARIOS, check_log, rules
@@ -40,9 +39,6 @@ RESULTS = Path(__file__).parents[1] / "results" / "worlds"
 SEED = 15  # of these test sets; nothing is trained or tuned on them
 SPEED = 0.01  # distance per tick
 ALONE = 2  # a network's first games are played one by one as well, to time its decisions
-
-Decide = Callable[[rules.State, rules.Rules], int]
-"""A game (B = 1, NumPy arrays) -> the deciding agent's next node. Each game gets one of its own."""
 
 
 @dataclass(frozen=True)
@@ -68,115 +64,6 @@ class Cell:
         rng = np.random.default_rng([SEED, self.n_nodes, self.n_agents, number])
         drawn = sample("uniform", rng, 1, self.n_nodes, self.n_agents, self.scenario)
         return drawn.instance(0, f"{self.scenario}-{self.size}-{number}")
-
-
-@dataclass(frozen=True)
-class Row:
-    """One game of one method. ``parse_lines`` reads it, and checks it against these annotations.
-
-    Attributes:
-        scenario, size, instance: which instance, see ``Cell``.
-        method: a key of ``METHODS``, or a file of weights.
-        makespan: by ``mtsp_env.check_log``; of a game that was cut off, with the penalty.
-        truncated: whether the game was cut off.
-        decisions: number of decisions.
-        seconds: CPU time of all decisions, with one thread; None: not measured.
-        searches: a planner's number of searches, else None.
-        iterations: a planner's iterations in each search, else None.
-        machine: processor, cores, platform and Python version.
-    """
-
-    scenario: str
-    size: str
-    instance: Annotated[int, Meta(ge=0)]
-    method: str
-    makespan: Annotated[float, Meta(ge=0)]
-    truncated: bool
-    decisions: Annotated[int, Meta(ge=0)]
-    seconds: Annotated[float, Meta(ge=0)] | None
-    searches: Annotated[int, Meta(ge=0)] | None
-    iterations: Annotated[int, Meta(ge=0)] | None
-    machine: dict[str, Any]
-
-    @property
-    def key(self) -> tuple:
-        """Identifies the game: a row with the same key is not played again."""
-        return self.scenario, self.size, self.instance, self.method
-
-
-def parse_lines(path: Path, data: bytes) -> Iterator[Row]:
-    """Parse the content of a file of rows; a ValueError names ``path`` and the line."""
-    for number, line in enumerate(data.splitlines(), start=1):
-        try:
-            row = msgspec.json.decode(line, type=Row)
-            if not math.isfinite(row.makespan):
-                raise ValueError(f"makespan must be finite, got {row.makespan}")
-        except (msgspec.DecodeError, ValueError) as error:
-            raise ValueError(f"{path}:{number}: damaged line: {error}") from error
-        yield row
-
-
-# Methods
-
-OBSERVED = "local: its open cities, and what each agent announces about itself"
-
-
-@dataclass(frozen=True)
-class Method:
-    """How a method is called in tables, what it needs to know, and what it is.
-
-    Exactly one of ``rule``, ``network`` and ``milliseconds`` says how it decides: a function of a random generator
-    that makes a ``Decide``, weights, or a planner's time for each search.
-    """
-
-    title: str
-    needs: str
-    rule: Callable[[np.random.Generator], Decide] | None = None
-    network: str | None = None
-    milliseconds: float | None = None
-
-
-def _random(rng: np.random.Generator) -> Decide:
-    def decide(game: rules.State, game_rules: rules.Rules) -> int:
-        legal = rules.legal_actions(game, game_rules, rules.agent_to_decide(game))[0]
-        return int(rng.choice(np.flatnonzero(legal)))
-
-    return decide
-
-
-def _nearest(rng: np.random.Generator) -> Decide:
-    def decide(game: rules.State, game_rules: rules.Rules) -> int:
-        seen = rules.observe(game, game_rules)
-        distance = np.where(seen.action_mask[0], np.hypot(*seen.cities[0].T), np.inf)
-        distance[0] = 1e9  # the depot only if no city is legal
-        return int(np.argmin(distance))
-
-    return decide
-
-
-METHODS: dict[str, Method] = {
-    "random": Method("random", "local: its open cities", rule=_random),
-    "nearest": Method("nearest city", "local: its open cities", rule=_nearest),
-    "default": Method("DAN `default`, greedy", OBSERVED, network="default"),
-    "joint": Method("`joint`, greedy", OBSERVED, network="joint"),
-    "world": Method("`world`, greedy", OBSERVED, network="world"),
-    "plan-once": Method("plan once (50 ms), then the nearest agent", "global: at the start", milliseconds=50.0),
-    "replanner-5": Method("Replanner, 5 ms per event", "global: at every event", milliseconds=5.0),
-    "replanner-50": Method("Replanner, 50 ms per event", "global: at every event", milliseconds=50.0),
-}
-BASELINE = "replanner-50"
-
-
-def find_method(name: str) -> Method:
-    """The method of a name in ``METHODS``, or that of a file of weights."""
-    if name in METHODS:
-        return METHODS[name]
-    return Method(f"`{name}`, greedy", OBSERVED, network=name)
-
-
-def is_available(name: str) -> bool:
-    """Whether a method can be played: its network is shipped, or it has none."""
-    return METHODS[name].network is None or METHODS[name].network in registry.shipped()
 
 
 # Games
@@ -330,8 +217,6 @@ def main(
         OSError: no such weights, or a file that cannot be written.
         ValueError: a value outside its range, or a damaged row.
     """
-    from benchmarks.reports.worlds import write_report  # imports matplotlib
-
     check_count("instances", instances, minimum=1)
     names = methods or tuple(name for name in METHODS if is_available(name))
     cells = [_cell(scenario, size) for size in sizes for scenario in scenarios]
