@@ -12,6 +12,7 @@ from typing import Annotated, Any
 from fastapi import FastAPI, HTTPException, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from fastapi_offline import FastAPIOffline
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -134,7 +135,8 @@ def create_app(
         yield
         queue.close()
 
-    app = FastAPI(title="mtsp-env: replanning", version=__version__, lifespan=lifespan)
+    # Its page /docs brings its scripts along, so that it can be read without the internet
+    app = FastAPIOffline(title="mtsp-env: replanning", version=__version__, lifespan=lifespan, redoc_url=None)
     app.add_middleware(_BodyLimit, limit=limits.body)
     app.add_exception_handler(RequestValidationError, _explain)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import multiprocessing
+import re
 import threading
 import time
 from collections import deque
@@ -267,6 +268,16 @@ def test_requests_are_described() -> None:
     example = described["components"]["schemas"]["SolveRequest"]["examples"][0]
     [answer] = exchange(create_app(LIMITS, deal), {"json": example})
     assert answer.status_code == 200
+
+
+def test_the_page_of_the_description_needs_no_internet() -> None:
+    app = create_app(LIMITS, deal)
+    [page] = exchange(app, {"method": "GET", "url": "/docs"})
+    files = re.findall(r'(?:src|href)="([^"]+)"', page.text)
+    assert len(files) >= 3  # script, style and icon
+    assert "://" not in page.text
+    answers = exchange(app, *({"method": "GET", "url": file} for file in files))
+    assert [answer.status_code for answer in answers] == [200] * len(files)
 
 
 @pytest.mark.parametrize(
