@@ -6,6 +6,8 @@ from typing import Annotated
 
 from dan_policy.arguments import SECONDS, arg, default, whole
 
+KEEP_ALIVE_SECONDS = 75  # after uvicorn's 5, a slow client would send its next request to a connection just closed
+
 
 def serve(
     host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1",
@@ -51,7 +53,13 @@ def serve(
     methods: tuple[Method, ...] = ("reference",) if policy is None else ("reference", "dan")
     app = create_app(limits, workers, methods)
     try:
-        # Connections that have sent nothing yet are not in the queue; they are limited as well.
-        uvicorn.run(app, host=host, port=port, access_log=False, limit_concurrency=2 * max_waiting + 64)
+        uvicorn.run(
+            app,
+            host=host,
+            port=port,
+            access_log=False,
+            limit_concurrency=2 * max_waiting + 64,  # also of connections that have sent nothing, and are in no queue
+            timeout_keep_alive=KEEP_ALIVE_SECONDS,
+        )
     finally:
         workers.close()
