@@ -82,11 +82,15 @@ def play(instance: Instance, game_rules: rules.Rules, decide: Decide) -> tuple[l
 
 
 def play_together(problem: Problem, game_rules: rules.Rules, choose: Choose) -> list[list[int]]:
-    """The decisions of the games of a problem, played side by side."""
+    """The decisions of the games of a problem, played side by side; nobody is asked who has no choice."""
     state = rules.start(problem, game_rules)
     decisions: list[list[int]] = [[] for _ in range(len(problem.nodes))]
     while not (over := rules.terminated(state) | rules.truncated(state, game_rules)).all():
-        actions = choose(state, rules.observe(state, game_rules))
+        seen = rules.observe(state, game_rules)
+        actions, asked = seen.action_mask.argmax(1), ~over & (seen.action_mask.sum(1) > 1)
+        if asked.any():
+            some = rules.state_from_arrays({name: a[asked] for name, a in state.arrays().items()}, problem.n_agents)
+            actions[asked] = choose(some, rules.observe(some, game_rules))
         for row in np.flatnonzero(~over):
             decisions[row].append(int(actions[row]))
         state = rules.depart(state, game_rules, actions)
