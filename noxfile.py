@@ -1,9 +1,13 @@
 """Tests on other Pythons, each in an environment of its own.
 
-nox                  every session
-nox -s env           the environment alone, without torch
-nox -s dan-3.12      the environment and the networks on one Python
+nox                         env and dan
+nox -s env                  the environment alone, without torch
+nox -s dan-3.12             the environment and the networks on one Python
+nox -s libraries            the examples of other libraries, one after the other: half an hour
+nox -s "libraries(sb3)"     one of them
 """
+
+from pathlib import Path
 
 import nox
 
@@ -38,6 +42,8 @@ DAN_TESTS = [
     "tests/test_rules.py",
     "tests/test_shipped.py",
 ]
+EXAMPLES = "examples/libraries"
+LIBRARIES = sorted(path.stem for path in Path(EXAMPLES, "requirements").glob("*.txt"))
 
 
 @nox.session(python=PYTHONS)
@@ -53,3 +59,12 @@ def dan(session: nox.Session) -> None:
     session.install("--constraint", "constraints.txt", "torch")
     session.install("--constraint", "constraints.txt", "--editable", ".[all]", *TOOLS)
     session.run("python", "-m", "pytest", *(session.posargs or DAN_TESTS))
+
+
+@nox.session(python="3.11", default=False)
+@nox.parametrize("library", LIBRARIES, ids=LIBRARIES)
+def libraries(session: nox.Session, library: str) -> None:
+    """Install a library beside this package and run its example: nox -s "libraries(sb3)" -- --steps 1000 --seed 1."""
+    session.install("torch==2.13.0")  # first and alone, as in the Makefile
+    session.install("--editable", ".[reference]", "--requirement", f"{EXAMPLES}/requirements/{library}.txt")
+    session.run("python", f"{EXAMPLES}/with_{library}.py", *session.posargs, env={"OMP_NUM_THREADS": "1"})
