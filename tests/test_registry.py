@@ -4,7 +4,7 @@ import json
 import math
 import pickle
 import sys
-from dataclasses import fields
+from dataclasses import dataclass, fields
 
 import pytest
 import torch
@@ -13,6 +13,8 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from dan_policy import DAN, NETWORKS, DANConfig, build, load, registry, save
+from train.network import make_network
+from train.reinforce_config import ReinforceConfig
 
 SMALL = DANConfig(embed_dim=16, feedforward_dim=32, n_heads=2, city_layers=1, prune_visited=True)
 
@@ -309,3 +311,21 @@ def test_loading_draws_no_random_numbers(file):
     before = torch.get_rng_state()
     load(file)
     assert torch.equal(torch.get_rng_state(), before)
+
+
+@dataclass(frozen=True)
+class ScaleConfig:
+    scale: float = 2.0
+
+
+class Scale(nn.Module):
+    in_keys = ("cities",)
+
+    def __init__(self, config: ScaleConfig):
+        super().__init__()
+        self.config = config
+
+
+def test_a_newly_registered_network_is_trained_with_its_own_defaults(monkeypatch):
+    monkeypatch.setitem(NETWORKS, "scale", registry.NetworkType(ScaleConfig, Scale))
+    assert make_network(ReinforceConfig(policy="scale")).config == ScaleConfig()

@@ -307,3 +307,9 @@ def test_a_markdown_table_has_a_cell_for_each_head():
     assert markdown_table(["a", "b"], [["x", 1], ["y", 2.5]]) == "| a | b |\n|---|---|\n| x | 1 |\n| y | 2.5 |"
     with pytest.raises(ValueError, match="expected 2 cells in a line, got 1"):
         markdown_table(["a", "b"], [["x"]])
+
+
+def test_a_new_table_needs_no_title(tmp_path, monkeypatch):
+    monkeypatch.setitem(suite.TABLES, "mine", suite.TABLES["smoke"])
+    text = report((write(tmp_path / "rows.jsonl", measured("deals", HALVES, table="mine")),))
+    assert "## Table mine\n" in text

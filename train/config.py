@@ -137,11 +137,11 @@ class RunConfig:
         return self.policy in NETWORKS
 
     def network_options(self) -> dict[str, Any]:
-        """The registered network's configuration, or the factory's keyword arguments."""
+        """The registered network's configuration (its defaults if it has no field here), or the factory's arguments."""
         if not self.registered:
             return dict(self.policy_options)
-        options = {type(value): value for value in vars(self).values()}
-        return asdict(options[NETWORKS[self.policy].config])
+        kind = NETWORKS[self.policy].config
+        return asdict(next((value for value in vars(self).values() if type(value) is kind), kind()))
 
     def generator(self) -> str | Generator:
         """The name of a distribution, or the function that ``package.module:function`` names.

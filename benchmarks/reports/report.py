@@ -60,9 +60,10 @@ def report(
 def _lines(all_results: Sequence[Results], files: Sequence[Path], against: str, pictures: dict[str, str]) -> list[str]:
     lines = ["# Results", "", *_origin(all_results, files)]
     for results in all_results:
-        lines += ["", f"## {TITLES[results.table]}", "", *tables.section(results, against)]
+        title = TITLES.get(results.table, f"Table {results.table}")
+        lines += ["", f"## {title}", "", *tables.section(results, against)]
         if results.table in pictures:
-            lines += ["", f"![{TITLES[results.table]}]({pictures[results.table]})"]
+            lines += ["", f"![{title}]({pictures[results.table]})"]
     return [*lines, ""]
 
 
