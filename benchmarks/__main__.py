@@ -9,7 +9,8 @@ from typing import Any
 
 import tyro
 
-from dan_policy.arguments import open_streams
+from benchmarks.solvers import Unavailable
+from dan_policy.arguments import check_docstrings, check_working_directory, deferred, one_line_errors, open_streams
 from mtsp_env.reading import printable
 
 # Only the module of the chosen command is imported: some need packages that others do without
@@ -35,7 +36,11 @@ COMMANDS = {
 def load(name: str) -> Callable[..., Any]:
     """The function of a command."""
     module, _, function = COMMANDS[name].partition(":")
-    return getattr(import_module(module), function)
+    try:
+        return getattr(import_module(module), function)
+    except TypeError:
+        check_docstrings()
+        raise
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -43,18 +48,21 @@ def main(argv: list[str] | None = None) -> int:
     open_streams()
     argv = sys.argv[1:] if argv is None else argv
     try:
-        if argv and argv[0] in COMMANDS:
-            prog = f"python -m benchmarks {argv[0]}"
-            result = tyro.cli(load(argv[0]), prog=prog, args=argv[1:])
-        else:
-            commands = {name: load(name) for name in COMMANDS}
-            result = tyro.extras.subcommand_cli_from_dict(commands, prog="python -m benchmarks", args=argv)
+        check_working_directory()
+        with one_line_errors("benchmarks"):
+            if argv and argv[0] in COMMANDS:
+                prog = f"python -m benchmarks {argv[0]}"
+                chosen = tyro.cli(deferred(load(argv[0])), prog=prog, args=argv[1:])
+            else:
+                commands = {name: deferred(load(name)) for name in COMMANDS}
+                chosen = tyro.extras.subcommand_cli_from_dict(commands, prog="python -m benchmarks", args=argv)
+        result = chosen()
         if result is not None:
             print(result)
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of our output, such as `head`, has closed it
         return 1
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ImportError, Unavailable) as error:
         return _refuse(str(error))
     except MemoryError as error:
         return _refuse(f"out of memory: {error}")

@@ -25,6 +25,7 @@ from benchmarks.suite import AnyCell, Cell, PublicCell, TsplibCell
 from mtsp_env.instance import Instance, Tours
 from mtsp_env.reading import read_file
 from mtsp_env.tours import check_tours, lower_bound, makespan
+from mtsp_env.writing import alone_in
 
 FOLDER = Path(__file__).parent / "best"
 TOLERANCE = 1e-9  # a makespan within this of the lower bound is optimal
@@ -64,9 +65,17 @@ def _read_file(file: Path) -> list[Tours | None]:
 def merge(cell: AnyCell, seed: int, candidates: Mapping[int, Tours], folder: Path = FOLDER) -> int:
     """Keep those of the candidates that are better than the kept tours; returns how many were.
 
+    Processes that do so at the same time wait for one another.
+
     Raises:
         ValueError: a damaged file, or tours that do not solve their instance.
     """
+    folder.mkdir(parents=True, exist_ok=True)
+    with alone_in(folder):
+        return _merge(cell, seed, candidates, folder)
+
+
+def _merge(cell: AnyCell, seed: int, candidates: Mapping[int, Tours], folder: Path) -> int:
     file = folder / cell.file(seed)
     cell = replace(cell, count=max([cell.count, len(_read_file(file)), *(i + 1 for i in candidates)]))
     kept, instances, improved = read(cell, seed, folder), cell.instances(seed), 0

@@ -1,6 +1,6 @@
 """Command lines read by tyro: kinds of arguments, and errors of one line.
 
-tyro draws a box around an error and exits with 2; the command ``mtsp`` prints one line instead.
+tyro draws a box around an error and exits with 2; the commands of this project print one line instead.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import itertools
 import math
 import os
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import redirect_stderr
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr
 from typing import Any, NoReturn
 
 try:
@@ -24,9 +24,22 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from mtsp_env.reading import printable
 
-__all__ = ["SECONDS", "Positional", "arg", "default", "open_streams", "parse", "refuse", "whole"]
+__all__ = [
+    "SECONDS",
+    "Positional",
+    "arg",
+    "check_docstrings",
+    "check_working_directory",
+    "default",
+    "deferred",
+    "one_line_errors",
+    "open_streams",
+    "parse",
+    "refuse",
+    "whole",
+]
 
-Command = Callable[..., None]
+Command = Callable[..., Any]
 
 
 def parse(commands: Sequence[Command], description: str, argv: Sequence[str]) -> Callable[[], None]:
@@ -37,27 +50,60 @@ def parse(commands: Sequence[Command], description: str, argv: Sequence[str]) ->
     app = tyro.extras.SubcommandApp()
     for command in commands:
         summary = (command.__doc__ or "").partition("\n")[0] if argv in ([], ["-h"], ["--help"]) else None
-        app.command(name=command.__name__, help=summary)(_deferred(command))
+        app.command(name=command.__name__, help=summary)(deferred(command))
+    with one_line_errors("mtsp"):
+        return app.cli(prog="mtsp", description=description, args=argv, config=(tyro.conf.FlagCreatePairsOff,))
+
+
+@contextmanager
+def one_line_errors(program: str) -> Iterator[None]:
+    """A context in which tyro's errors exit with 2 and one line on stderr, ``PROGRAM: error: ...``.
+
+    It is for parsing alone: stderr is caught.
+    """
     report = io.StringIO()
     try:
         with redirect_stderr(report):
-            return app.cli(prog="mtsp", description=description, args=argv, config=(tyro.conf.FlagCreatePairsOff,))
+            yield
     except SystemExit as end:
         if end.code in (None, 0):
             raise
-        refuse(_without_box(report.getvalue()))
+        refuse(_without_box(report.getvalue()), program)
 
 
 def open_streams() -> None:
-    """Let what is printed vanish if the process was started without a standard output or error (``>&-``)."""
+    """Let what is printed vanish if the process was started without a standard output or error (``>&-``).
+
+    The next files that such a process opens would take the places of its standard streams, and everything that prints
+    there, such as a library in C, would write into them: /dev/null takes the places.
+    """
+    for descriptor in range(3):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # gets the smallest number that is free
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115 (open until the process ends)
 
 
-def refuse(message: str) -> NoReturn:
+def check_docstrings() -> None:
+    """Raise ImportError under ``python -OO``, which drops docstrings: TorchRL cannot be imported then."""
+    if sys.flags.optimize > 1:
+        raise ImportError("TorchRL cannot be imported without docstrings: run Python without -OO")
+
+
+def check_working_directory() -> None:
+    """Raise FileNotFoundError if the working directory has been removed: MKL would end the process there."""
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        raise FileNotFoundError("the working directory is gone: change to one that exists") from None
+
+
+def refuse(message: str, program: str = "mtsp") -> NoReturn:
     """Exit with 2 and ``message`` as one line on stderr."""
-    sys.stderr.write(f"mtsp: error: {printable(' '.join(message.split()))}\n")
+    sys.stderr.write(f"{program}: error: {printable(' '.join(message.split()))}\n")
     sys.exit(2)
 
 
@@ -93,11 +139,11 @@ SECONDS = _number(
 """An annotation for a time."""
 
 
-def _deferred(command: Command) -> Callable[..., Callable[[], None]]:
+def deferred(command: Command) -> Callable[..., Callable[[], Any]]:
     """tyro calls what it parses: this binds the arguments, so that the command runs after parsing."""
 
     @functools.wraps(command)
-    def bind(*arguments: Any, **options: Any) -> Callable[[], None]:
+    def bind(*arguments: Any, **options: Any) -> Callable[[], Any]:
         return functools.partial(command, *arguments, **options)
 
     return bind

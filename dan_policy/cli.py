@@ -19,7 +19,18 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from dan_policy.arguments import SECONDS, Positional, arg, default, open_streams, parse, refuse, whole
+from dan_policy.arguments import (
+    SECONDS,
+    Positional,
+    arg,
+    check_docstrings,
+    check_working_directory,
+    default,
+    open_streams,
+    parse,
+    refuse,
+    whole,
+)
 from dan_policy.serve import serve
 from mtsp_env import render
 from mtsp_env.distributions import sample
@@ -137,6 +148,7 @@ def solve(
         out: write the tours as JSON
         as_json: print one JSON object per file and nothing else
     """
+    check_working_directory()
     options: dict[str, dict[str, Any]] = {
         "dan": {
             "policy": policy,
@@ -206,6 +218,7 @@ def _dan(
     precision: Literal["auto", "float32", "bfloat16"] | None,
     **options: Any,
 ) -> Solver:
+    check_docstrings()
     try:
         import dan_policy
 

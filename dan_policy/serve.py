@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from dan_policy.arguments import SECONDS, arg, default, whole
+from dan_policy.arguments import SECONDS, arg, check_docstrings, check_working_directory, default, whole
 
 KEEP_ALIVE_SECONDS = 75  # after uvicorn's 5, a slow client would send its next request to a connection just closed
 
@@ -37,6 +37,9 @@ def serve(
         max_seconds: longest deadline that a request may set
         max_waiting: most requests that wait or are planned at the same time
     """
+    check_working_directory()
+    if policy is not None:
+        check_docstrings()
     if port > 65535:
         raise ValueError(f"--port: must be at most 65535, got {port}")
     try:

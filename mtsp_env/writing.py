@@ -76,6 +76,23 @@ def lock(file: IO) -> None:
     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """A context in which no other process is in such a context for this folder; waits for it. POSIX only.
+
+    Raises:
+        OSError: there is no such folder, or its file system has no locks.
+    """
+    import fcntl
+
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def _open_stream(path: Path) -> IO[bytes] | None:
     """``path`` opened for writing if it is a pipe or a character device; None if it is a regular file or missing."""
     descriptor = _descriptor(path)

@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -105,6 +106,15 @@ def test_best_known_tours_only_ever_improve(tmp_path):
     assert (tmp_path / CELL.file(1)).read_bytes() == written
     assert len(list(tmp_path.iterdir())) == 1
     assert best_known.read(CELL, 2, tmp_path) == {}
+
+
+def test_processes_that_keep_tours_at_the_same_time_wait_for_one_another(tmp_path):
+    """Each takes the tours of one instance; none is lost."""
+    cell = Cell(8, 2, 12)
+    with ThreadPoolExecutor(12) as pool:  # a lock belongs to an open file, so that it also keeps threads apart
+        tours = [one_agent_does_it_all(instance) for instance in cell.instances(1)]
+        assert list(pool.map(lambda i: best_known.merge(cell, 1, {i: tours[i]}, tmp_path), range(12))) == [1] * 12
+    assert best_known.read(cell, 1, tmp_path) == dict(enumerate(tours))
 
 
 def test_wrong_tours_are_neither_kept_nor_read(tmp_path):

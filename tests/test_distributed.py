@@ -9,12 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.states import same
 
 from dan_policy import DAN, DANConfig, make_actor
 from train import checkpoint, distributed
 from train.collect import draw, play
 from train.loss import EpisodicReinforceLoss, backward, decisions_with_advantage
 from train.presets import QUICK
+from train.reinforce import ReinforceLearner
 
 ROOT = Path(__file__).parent.parent
 TINY = replace(QUICK, n_nodes=(6, 6), n_agents=(2, 2), network=DANConfig(embed_dim=16, feedforward_dim=16, n_heads=2))
@@ -27,6 +29,12 @@ def torchrun(*arguments, processes=2):
         [*command, *map(str, arguments)], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300
     )
     assert done.returncode == 0, done.stderr[-3000:]
+    return done.stderr
+
+
+SMALL = ["-m", "train", "reinforce", "quick", "--n-nodes", 5, 7, "--batch-size", 4, "--network.embed-dim", 16,
+         "--challenge-instances", 8, "--challenge-every", 2, "--validation-instances", 4,
+         "--no-tensorboard"]  # fmt: skip
 
 
 def gradient(network, seeds):
@@ -70,11 +78,8 @@ def test_two_processes_have_the_gradient_of_one_with_all_their_episodes(tmp_path
 
 @pytest.mark.slow
 def test_training_under_torchrun_keeps_the_processes_alike_and_resumes(tmp_path):
-    small = ["-m", "train", "reinforce", "quick", "--out", tmp_path, "--n-nodes", 5, 7, "--batch-size", 4,
-             "--network.embed-dim", 16, "--challenge-instances", 8, "--challenge-every", 2, "--validation-instances", 4,
-             "--no-tensorboard"]  # fmt: skip
-    torchrun(*small, "--steps", 2)
-    torchrun(*small, "--steps", 3, "--resume")
+    torchrun(*SMALL, "--out", tmp_path, "--steps", 2)
+    torchrun(*SMALL, "--out", tmp_path, "--steps", 3, "--resume")
     one, other = (checkpoint.read(tmp_path / name) for name in ("checkpoint.pt", "checkpoint-1.pt"))
     assert one["progress"]["step"] == other["progress"]["step"] == 3
     assert one["progress"]["instances"] == 3 * 4 * 2
@@ -82,6 +87,44 @@ def test_training_under_torchrun_keeps_the_processes_alike_and_resumes(tmp_path)
         assert torch.equal(value, other["network"][name])
     assert one["random"]["numpy"] != other["random"]["numpy"]  # each draws its own instances
     assert not torch.equal(one["baseline"]["test_costs"], other["baseline"]["test_costs"])
+
+
+@pytest.mark.slow
+def test_a_damaged_checkpoint_sends_all_processes_back_to_the_one_before(tmp_path):
+    """The continuation ends as a run would have ended whose files stayed whole."""
+    every_step = [*SMALL, "--checkpoint-every", 1]
+    torchrun(*every_step, "--steps", 4, "--out", tmp_path / "whole")
+    torchrun(*every_step, "--steps", 3, "--out", tmp_path / "damaged")
+    path = tmp_path / "damaged" / "checkpoint-1.pt"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    errors = torchrun(*every_step, "--steps", 4, "--resume", "--out", tmp_path / "damaged")
+    assert f"{path} is left out, step 2 is continued ({path}: not a checkpoint, or a damaged one" in errors
+    assert f"{path.with_name('checkpoint.pt')} is left out, step 2 is continued (another process" in errors
+    for name in ("checkpoint.pt", "checkpoint-1.pt"):
+        whole, again = (checkpoint.read(tmp_path / run / name) for run in ("whole", "damaged"))
+        assert again["progress"]["step"] == 4
+        for part in ("network", "average", "optimiser", "schedule", "baseline", "random"):
+            assert same(whole[part], again[part]), (name, part)
+    steps = np.loadtxt(tmp_path / "damaged" / "logs" / "scalars" / "cost.csv", delimiter=",")[:, 0]
+    assert steps.tolist() == [1, 2, 3, 4]
+
+
+def test_processes_without_a_common_checkpoint_all_say_so(tmp_path, monkeypatch):
+    """The other process has saved steps 6 and 7."""
+    learner = ReinforceLearner(replace(TINY, out=tmp_path, steps=5, resume=True, validation_instances=2))
+    learner.step = 5
+    learner.save()
+    with monkeypatch.context() as patch:
+        patch.setattr("train.learner.world_size", lambda: 2)
+        patch.setattr("train.learner.gather", lambda steps: torch.cat([steps, torch.tensor([7, 6])]))
+        with pytest.raises(ValueError, match=r"no whole checkpoint: they have those of steps \[\[5\], \[6, 7\]\]"):
+            learner.restore()
+        patch.setattr("train.learner.gather", lambda steps: torch.cat([steps, torch.tensor([5, 4])]))
+        with pytest.raises(ValueError, match="the run had 1 processes, and would now have 2"):
+            learner.restore()
+    learner.restore()
 
 
 def test_alone_everything_is_the_identity():

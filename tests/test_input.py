@@ -198,13 +198,6 @@ def test_control_characters_are_not_printed(folder, capsys) -> None:
     assert "\x1b" not in refused(capsys, "solve", "\x1b[31m.tsp", "--agents", "1")
 
 
-def test_without_a_standard_output_the_command_works(tmp_path) -> None:
-    command = f'"{sys.executable}" -m dan_policy.cli generate --nodes 5 --agents 2 "{tmp_path}/a.json" >&-'
-    done = subprocess.run(["sh", "-c", command], cwd=ROOT, capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert read_instance(tmp_path / "a.json").n_nodes == 5
-
-
 def test_in_a_folder_that_is_gone_the_command_works_with_whole_paths(tmp_path) -> None:
     gone = tmp_path / "gone"
     code = (

@@ -156,9 +156,24 @@ def test_curves_are_trained_until_their_time_is_over(small, tmp_path, monkeypatc
     assert len((tmp_path / "curves.csv").read_text()) > len(before)
 
 
+@pytest.mark.slow
+def test_curves_that_were_killed_before_their_first_checkpoint_are_begun_again(small, tmp_path, monkeypatch):
+    monkeypatch.setattr(curves, "QUICK", replace(QUICK, batch_size=4, challenge_instances=4))
+    for name in ("reinforce", "imitate"):
+        (tmp_path / "runs" / name / "logs").mkdir(parents=True)
+    curves.main(0.001, tmp_path / "runs", tmp_path)
+    assert (tmp_path / "curves.csv").exists()
+
+
+def test_damaged_results_are_named(tmp_path):
+    (tmp_path / "dan-0-seed0.json").write_text('{"minutes": 1')
+    with pytest.raises(ValueError, match=r"dan-0-seed0\.json: not a JSON file"):
+        ablations.main(minutes=1.0, folder=tmp_path, out=tmp_path / "table.md")
+
+
 @pytest.mark.parametrize("module", [ablations, curves])
-@pytest.mark.parametrize("minutes", [0.0, -1.0, float("nan")])
+@pytest.mark.parametrize("minutes", [0.0, -1.0, float("nan"), float("inf")])
 def test_no_time_is_refused(module, minutes, tmp_path):
-    with pytest.raises(ValueError, match="minutes must be above 0"):
+    with pytest.raises(ValueError, match="minutes must be a finite number of minutes above 0"):
         module.main(minutes=minutes, folder=tmp_path / "runs")
     assert not (tmp_path / "runs").exists()

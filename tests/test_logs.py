@@ -1,5 +1,7 @@
 """The logs of a run that is continued hold every step once."""
 
+import pytest
+
 from train.logs import Logs
 
 
@@ -34,6 +36,14 @@ def test_a_run_that_died_before_its_first_checkpoint_starts_afresh(tmp_path):
     write(tmp_path, 1, 1)
     assert rows(tmp_path) == ["1,0.5"]
     assert rows(tmp_path, "validation_cost") == []
+
+
+@pytest.mark.parametrize("content", [b"1,0.5\nx,1.0\n", b"1,0.5\n\xff,1.0\n"])
+def test_a_damaged_file_is_named(tmp_path, content):
+    write(tmp_path, 1, 1)
+    (tmp_path / "logs" / "scalars" / "cost.csv").write_bytes(content)
+    with pytest.raises(ValueError, match=r"cost\.csv: damaged, move it away to continue the run"):
+        write(tmp_path, 3, 3, step=2)
 
 
 def test_tensorboard_shows_every_step_once(tmp_path):

@@ -31,5 +31,8 @@ def test_growth_is_noticed(monkeypatch):
 def test_bad_input_is_named(capsys):
     assert main(["memory", "--share", "0.0001"]) == 2
     assert "rounds of 'AEC episodes' must be a whole number of at least 10, got 2" in capsys.readouterr().err
+    for share in ("nan", "inf", "0"):
+        assert main(["memory", "--share", share]) == 2
+        assert "share must be a finite number above 0, got" in capsys.readouterr().err
     assert main(["memory", "--cases", "nothing"]) == 2
     assert "unknown case 'nothing'; choose from" in capsys.readouterr().err

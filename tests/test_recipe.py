@@ -1,6 +1,7 @@
 """A recipe is read with every mistake named; its stages follow one another, and resume bit for bit."""
 
 import json
+import os
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from train import checkpoint
 from train.__main__ import main
 from train.imitate import ImitationLearner
 from train.improve import ImproveLearner
+from train.loop import sole_writer
 from train.presets import REFINE
 from train.recipe import PREVIOUS, UNLIMITED, read_recipe
 from train.reinforce import ReinforceLearner
@@ -301,6 +303,30 @@ def test_a_run_is_resumed_only_with_its_own_recipe(written, tmp_path):
     (out / "log.json").write_text('{"stages": 3}')
     with pytest.raises(ValueError, match=r"log\.json: not a log of a recipe, or a damaged one"):
         recipe(written(SHARED + STAGES), out, resume=True)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes with names")
+def test_a_recipe_is_a_regular_file(tmp_path):
+    """A pipe may never end."""
+    os.mkfifo(tmp_path / "recipe.toml")
+    with pytest.raises(ValueError, match=r"recipe\.toml: not a regular file"):
+        recipe(tmp_path / "recipe.toml", tmp_path / "run")
+
+
+def test_one_recipe_at_a_time_is_trained_in_a_folder(one_stage, tmp_path):
+    out = tmp_path / "run"
+    with sole_writer(out):
+        for resume in (False, True):
+            with pytest.raises(ValueError, match="run: another run is writing to it"):
+                recipe(one_stage, out, resume=resume)
+            (out / "log.json").touch()
+
+
+def test_a_stage_whose_checkpoint_lacks_its_progress_is_refused(one_stage, tmp_path):
+    recipe(one_stage, tmp_path / "run", seconds=1e-9)
+    checkpoint.write(tmp_path / "run" / "first" / "checkpoint.pt", {"network": {}})
+    with pytest.raises(ValueError, match=r"first/checkpoint\.pt: it does not say how long its run took .*'progress'"):
+        recipe(one_stage, tmp_path / "run", resume=True)
 
 
 def test_the_command_line_replaces_device_and_threads(one_stage, tmp_path, capsys):

@@ -180,6 +180,14 @@ def test_the_reduction_of_the_sample_is_added_for_instances_that_are_neither_pro
     assert row == [f"| 50, 5 | 2 | 2.000 ± 1.000 | 1.20 ± {100 * error:.2f} | no |"]
 
 
+def test_a_damaged_list_of_long_runs_is_named(monkeypatch, places) -> None:
+    places["out"].parent.mkdir()
+    places["out"].with_suffix(".json").write_text("{")
+    monkeypatch.setattr(reference_gaps, "improve", Fake())
+    with pytest.raises(ValueError, match=r"\.json: not a JSON file"):
+        reference_gaps.main(**{"instances": 2, "cells": ("8x2",), "best_seconds": 0.1, **places})
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -1,5 +1,6 @@
 """What a training run writes, how it is resumed bit for bit, and what it refuses."""
 
+import re
 import signal
 import threading
 from dataclasses import replace
@@ -171,13 +172,18 @@ def test_what_cannot_be_trained_is_named(options, message):
         ReinforceLearner(replace(TINY, **options))
 
 
-def test_a_lack_of_memory_is_one_line(tmp_path, capsys):
-    for option in (["--batch-size", "100000000000"], ["--validation-instances", "100000000000"]):
-        command = ["reinforce", "quick", "--steps", "1", "--network.embed-dim", "16", "--challenge-instances", "2"]
-        command += ["--validation-instances", "2", "--no-tensorboard", "--out", str(tmp_path / option[0]), *option]
-        assert main(command) == 2
-        printed = capsys.readouterr().err
-        assert printed.startswith("train: error: out of memory (") and printed.count("\n") == 1
+@pytest.mark.parametrize("option", [["--batch-size", "100000000000"], ["--validation-instances", "100000000000"]])
+@pytest.mark.parametrize("checked", [True, False])
+def test_a_lack_of_memory_is_one_line(tmp_path, capsys, monkeypatch, checked, option):
+    """Sizes are refused before memory is asked for, with those that fit; what the check misses is one line as well."""
+    if not checked:
+        monkeypatch.setattr("train.collect.check_memory", lambda *_: None)
+    expected = r"the number of instances .* 100000000000 needs about .* fits" if checked else r"out of memory \("
+    command = ["reinforce", "quick", "--steps", "1", "--network.embed-dim", "16", "--challenge-instances", "2"]
+    command += ["--validation-instances", "2", "--no-tensorboard", "--out", str(tmp_path / option[0]), *option]
+    assert main(command) == 2
+    printed = capsys.readouterr().err
+    assert re.match(f"train: error: {expected}", printed) and printed.count("\n") == 1
 
 
 def test_dropping_visited_cities_can_be_switched_on_and_off_with_the_same_weights(tmp_path):

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM end `python -m train` with 130 and 143 at any time; kill -9 leaves no process behind."""
+"""Ctrl-C, SIGTERM and SIGHUP end `python -m train` with 130, 143 and 129; kill -9 leaves no process behind."""
 
 import os
 import signal
@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import psutil
 import pytest
 from helpers.processes import alive, children, wait_until
 
@@ -20,11 +21,12 @@ REINFORCE = ["reinforce", "quick", "--batch-size", "2", "--challenge-instances",
 IMITATE = ["imitate", "--nodes-per-agent", "2", "--set-tokens", "100", "--buffer", "4", *SMALL]
 
 
-def train(*arguments):
-    """A running ``python -m train``."""
+def train(*arguments, **options):
+    """A running ``python -m train``, started with the ``options`` of Popen."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "train", *map(str, arguments)]
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(command, env=environment, **pipes, **options)
 
 
 def steps(folder):
@@ -42,7 +44,7 @@ def test_a_signal_while_everything_is_imported_ends_with_one_line(number, tmp_pa
     maps = Path(f"/proc/{process.pid}/maps")
     wait_until(lambda: "libtorch" in maps.read_text())
     process.send_signal(number)
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=300)
     assert (process.returncode, errors) == (CODES[number], f"train: ended by {number.name}\n")
 
 
@@ -54,26 +56,40 @@ def test_a_signal_during_a_challenge_saves_the_step(number, tmp_path):
     process = train(*REINFORCE, *many, "--out", tmp_path)
     wait_until(lambda: steps(tmp_path) >= 1)
     process.send_signal(number)
-    _, errors = process.communicate(timeout=120)
+    _, errors = process.communicate(timeout=300)
     assert process.returncode == CODES[number]
     assert "Traceback" not in errors and errors.splitlines()[-1] == f"train: ended by {number.name}"
     assert checkpoint.read(tmp_path / "checkpoint.pt")["progress"]["step"] == steps(tmp_path)
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.slow
-def test_ctrl_c_in_a_terminal_reaches_the_label_workers_too_and_the_run_is_saved(tmp_path):
-    """A terminal sends SIGINT to the whole process group."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    process = subprocess.Popen(
-        [sys.executable, "-m", "train", *IMITATE, "--steps", "100000", "--out", str(tmp_path)],
-        env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True,
-    )  # fmt: skip
+def test_a_signal_to_the_whole_process_group_reaches_the_label_workers_too_and_the_run_is_saved(number, tmp_path):
+    """Ctrl-C in a terminal, a job scheduler that ends a job, and a terminal that is closed send such signals.
+
+    The buffer holds one set and its workers make one at a time, so that the run needs labels to finish its step.
+    """
+    few = ["--buffer", "1", "--sets-per-step", "1", "--passes", "0.01", "--teacher-iterations", "2000"]
+    process = train(*IMITATE, *few, "--steps", 100000, "--out", tmp_path, start_new_session=True)
     wait_until(lambda: steps(tmp_path) >= 1)
-    os.killpg(process.pid, signal.SIGINT)
-    _, errors = process.communicate(timeout=120)
-    assert process.returncode == 130
-    assert "Traceback" not in errors and errors.splitlines()[-1] == "train: ended by SIGINT"
-    assert checkpoint.read(tmp_path / "checkpoint.pt")["progress"]["step"] == steps(tmp_path)
+    os.killpg(process.pid, number)
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 128 + number, errors
+    assert "Traceback" not in errors and errors.splitlines()[-1] == f"train: ended by {number.name}"
+    assert checkpoint.read(tmp_path / "checkpoint.pt")["progress"]["step"] == steps(tmp_path) >= 1
+
+
+@pytest.mark.slow
+def test_a_label_worker_that_dies_ends_the_run_and_the_other_workers(tmp_path):
+    """As when memory runs out. The pool then sends SIGTERM to the others, which they heed if their parent sends it."""
+    process = train(*IMITATE, "--steps", 100000, "--workers", 2, "--out", tmp_path)
+    wait_until(lambda: steps(tmp_path) >= 1)
+    started = children(process.pid)
+    os.kill(next(pid for pid in started if "spawn_main" in " ".join(psutil.Process(pid).cmdline())), signal.SIGKILL)
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 2
+    assert errors.splitlines()[-1].startswith("train: error: a process that makes labels has died")
+    wait_until(lambda: not any(map(alive, started)))
 
 
 @pytest.mark.slow

@@ -11,6 +11,21 @@ from train.interrupts import exit_on_signals
 if __name__ == "__main__":
     exit_on_signals()  # before torch is imported, which takes seconds
 
+from dan_policy.arguments import (
+    check_docstrings,
+    check_working_directory,
+    deferred,
+    one_line_errors,
+    open_streams,
+    refuse,
+)
+
+if __name__ == "__main__":
+    try:
+        check_docstrings()
+    except ImportError as error:
+        refuse(str(error), "train")
+
 # Number of kernels that oneDNN caches; PyTorch reads it when it is loaded. Batches have many shapes, and building a
 # kernel takes milliseconds.
 os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "8192")
@@ -18,6 +33,7 @@ os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "8192")
 import torch
 import tyro
 
+from mtsp_env.reading import printable
 from train.average import average
 from train.imitate import imitate
 from train.improve import improve
@@ -27,13 +43,17 @@ from train.validate import validate
 
 app = tyro.extras.SubcommandApp()
 for command in (recipe, imitate, reinforce, improve, average, validate):
-    app.command(command)
+    app.command(deferred(command))
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run a command and return 0. Bad input, divergence and a lack of memory print one line to stderr and return 2."""
+    open_streams()
     try:
-        app.cli(prog="python -m train", description="Train networks for the MinMax mTSP.", args=argv)
+        check_working_directory()
+        with one_line_errors("train"):
+            chosen = app.cli(prog="python -m train", description="Train networks for the MinMax mTSP.", args=argv)
+        chosen()
     except (ValueError, OSError, ImportError, FloatingPointError) as error:
         return _refuse(str(error))
     except BrokenExecutor as error:
@@ -46,7 +66,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _refuse(message: str) -> int:
-    print(f"train: error: {' '.join(message.split())}", file=sys.stderr)
+    print(f"train: error: {printable(' '.join(message.split()))}", file=sys.stderr)
     return 2
 
 

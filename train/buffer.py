@@ -20,6 +20,7 @@ from torch import Tensor
 from dan_policy.actor import Key
 from dan_policy.registry import find
 from train.demonstrations import Demonstrations, as_decisions, demonstrate
+from train.interrupts import ENDING
 from train.plans import PLAN_KEYS, add_plans
 from train.supervised_config import ImitateConfig
 
@@ -88,8 +89,9 @@ class Buffer:
             return demonstrate(self.config, index)
         if self._pool is None:
             spawn = multiprocessing.get_context("spawn")  # a fork of a process with threads may hang
-            self._pool = ProcessPoolExecutor(self.config.workers, spawn, _set_up_worker)
-        with _sigint_blocked():  # which workers inherit when they start: Ctrl-C is for the learning process
+            with _signals_blocked():  # its resource tracker inherits that, and unblocks some of them here as it starts
+                self._pool = ProcessPoolExecutor(self.config.workers, spawn, _set_up_worker)
+        with _signals_blocked():  # which workers inherit when they start: signals are for the learning process
             for ahead in range(index, index + 2 * self.config.workers + 1):
                 if ahead not in self._pending:
                     self._pending[ahead] = self._pool.submit(demonstrate, self.config, ahead)
@@ -127,9 +129,9 @@ class Buffer:
 
 
 @contextmanager
-def _sigint_blocked() -> Iterator[None]:
-    """A context in which SIGINT waits."""
-    old = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+def _signals_blocked() -> Iterator[None]:
+    """A context in which SIGINT, SIGTERM and SIGHUP wait."""
+    old = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
     try:
         yield
     finally:
@@ -137,11 +139,27 @@ def _sigint_blocked() -> Iterator[None]:
 
 
 def _set_up_worker() -> None:
-    """A worker shares the cores with the learning process at a lower priority, and ends when that process does."""
+    """A worker shares the cores with the learning process at a lower priority, and ends when that process does.
+
+    A terminal or a job scheduler sends its signals to all processes of a run. The learning process decides what they
+    mean, and still needs labels to finish its step.
+    """
     Thread(target=_end_with_parent, daemon=True).start()
+    if hasattr(signal, "sigwaitinfo"):
+        Thread(target=_end_on_parents_signal, daemon=True).start()
+    else:  # macOS does not say who sent a signal, and the pool ends its workers by SIGTERM if one of them has died
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     torch.set_num_threads(1)
     if hasattr(os, "nice"):
         os.nice(5)
+
+
+def _end_on_parents_signal() -> None:
+    """Take the signals that are blocked in this process, and end on SIGTERM if the parent has sent it."""
+    while True:
+        received = signal.sigwaitinfo(ENDING)
+        if received.si_signo == signal.SIGTERM and received.si_pid == os.getppid():
+            os._exit(1)
 
 
 def _end_with_parent() -> None:

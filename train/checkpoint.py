@@ -58,6 +58,12 @@ def previous(path: Path) -> Path:
     return path.with_name(f"{path.stem}.previous{path.suffix}")
 
 
+def go_back(path: Path) -> None:
+    """Let the checkpoint before the one at ``path`` take its place, and keep it as ``previous(path)`` as well."""
+    with atomic_write(path) as temporary:
+        shutil.copyfile(previous(path), temporary)
+
+
 def read(path: Path) -> dict[str, Any]:
     """Read what ``write`` wrote. No code in the file is executed.
 
@@ -80,6 +86,15 @@ def read(path: Path) -> dict[str, Any]:
     if not isinstance(state, dict):
         raise ValueError(f"{path}: not a checkpoint: it holds a {type(state).__name__}{_way_out(path)}")
     return state
+
+
+def seconds(path: Path) -> float:
+    """The seconds of training and validation behind the checkpoint at ``path``. Raises as ``read``."""
+    state = read(path)
+    try:
+        return float(state["progress"]["seconds"])
+    except (LookupError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: it does not say how long its run took ({type(error).__name__}: {error})") from error
 
 
 def _verified(data: bytes) -> memoryview:

@@ -14,8 +14,11 @@ from dan_policy.symmetry import views
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.distributions import sample
 from mtsp_env.instance import Problem
+from mtsp_env.machine import check_memory
 from mtsp_env.rules import Depot
 from train.config import RunConfig
+
+BYTES_PER_NODE = 48  # of an instance while it is drawn: two float64, and copies
 
 
 def draw_size(rng: np.random.Generator, config: RunConfig) -> tuple[int, int]:
@@ -38,9 +41,13 @@ def draw(
         batch: number of instances.
         tokens: upper bound on instances times nodes, which may reduce their number to no less than 1; None: no bound.
         size: n and m; None draws them.
+
+    Raises:
+        ValueError: the instances do not fit into the memory, or the distribution cannot be drawn from.
     """
     n_nodes, n_agents = size or draw_size(rng, config)
     batch = batch if tokens is None else max(1, min(batch, tokens // n_nodes))
+    check_memory(f"the number of instances with {n_nodes} nodes", batch, BYTES_PER_NODE * n_nodes)
     try:
         arrays = sample(config.generator(), rng, batch, n_nodes, n_agents).arrays
     except TypeError as error:  # a function of the user's that takes or returns something else
@@ -74,7 +81,9 @@ def repeat(problem: Problem, samples: int) -> Problem:
 
 def draw_set(rng: np.random.Generator, config: RunConfig, count: int, sizes: int = 8) -> list[Problem]:
     """``count`` instances to compare policies on, in at most ``sizes`` batches, each with its own n and m."""
-    counts = [len(part) for part in np.array_split(np.arange(count), min(sizes, count))]
+    check_memory("the number of instances to compare policies on", count, BYTES_PER_NODE * config.n_nodes[0])
+    sizes = min(sizes, count)
+    counts = [count // sizes + (number < count % sizes) for number in range(sizes)]
     return [draw(rng, config, part) for part in counts]
 
 

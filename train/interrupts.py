@@ -1,4 +1,5 @@
-"""Ctrl-C (SIGINT) and SIGTERM: a command ends with exit code 130 or 143, and a run saves first.
+"""Ctrl-C (SIGINT), SIGTERM and a closed terminal (SIGHUP): a command ends with exit code 130, 143 or 129, and a run
+saves first.
 
 This module imports nothing heavy, so that ``python -m train`` can handle signals while it imports the rest.
 """
@@ -8,28 +9,32 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def exit_on_signals() -> None:
-    """From now on, SIGINT and SIGTERM end the process with one line on stderr and exit code 130 or 143.
+    """From now on, ``ENDING`` signals end the process with one line on stderr and exit code 128 + number.
 
-    They raise SystemExit, so that ``finally`` clauses run.
+    They raise SystemExit, so that ``finally`` clauses run. SIGHUP stays ignored if it is, as ``nohup`` has it.
     """
 
     def end(number: int, _frame: object) -> None:
-        print(f"train: ended by {signal.Signals(number).name}", file=sys.stderr)
+        with suppress(OSError):  # a terminal that has been closed
+            print(f"train: ended by {signal.Signals(number).name}", file=sys.stderr)
         sys.exit(128 + number)
 
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, end)
+    for number in ENDING:
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, end)
 
 
 @contextmanager
 def postponed(*numbers: int) -> Iterator[list[int]]:
     """Collect signals; after the block, the first is raised again for the handler that was there before.
 
-    A second signal does not wait for the end of the block.
+    A second signal does not wait for the end of the block. Signals that are ignored stay so.
 
     >>> with postponed(signal.SIGINT) as caught:
     ...     while not caught:
@@ -47,7 +52,8 @@ def postponed(*numbers: int) -> Iterator[list[int]]:
         for number, handler in old.items():
             signal.signal(number, handler)
 
-    old = {number: signal.signal(number, collect) for number in numbers}
+    heeded = [number for number in numbers if signal.getsignal(number) != signal.SIG_IGN]
+    old = {number: signal.signal(number, collect) for number in heeded}
     try:
         yield caught
     finally:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from abc import ABC, abstractmethod
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
@@ -20,6 +21,7 @@ from train.config import RunConfig
 from train.distributed import gather, rank, world_size
 from train.network import make_network, save_weights
 
+PROGRESS = ("step", "instances", "seconds", "best")  # what a checkpoint says about how far the run has come
 VALIDATION_SEED = 987_654_321  # the same held-out instances in every run; training never uses it
 
 
@@ -108,13 +110,13 @@ class Learner(ABC):
 
     def save(self) -> None:
         """Write a checkpoint, and the current weights to ``last.safetensors``."""
-        progress = {"step": self.step, "instances": self.instances, "seconds": self.seconds, "best": self.best}
+        progress = {name: getattr(self, name) for name in PROGRESS}
         state = {
             "config": self.config.to_dict(),
             "network": self.network.state_dict(),
             "average": self.average.state_dict(),
             "random": checkpoint.random_state(self.rng),
-            "progress": progress,
+            "progress": progress | {"processes": world_size()},
         }
         checkpoint.write(checkpoint_path(self.config), state | self.state_dict())
         if rank() == 0:
@@ -125,16 +127,20 @@ class Learner(ABC):
 
         Raises:
             FileNotFoundError: there is none.
-            ValueError: it is damaged, of a run with another configuration, or of another step than those of others.
+            ValueError: it is damaged, or of a run with another configuration or another number of processes; or the
+                processes have no whole checkpoint of the same step.
         """
         path = checkpoint_path(self.config)
         try:
             state = self._common_state(path)
             checkpoint.check_same_run(state["config"], self.config)
+            before = state["progress"].get("processes", world_size())  # older checkpoints do not say
+            if before != world_size():
+                raise ValueError(f"{path}: the run had {before} processes, and would now have {world_size()}")
             self.network.load_state_dict(state["network"])
             self.average.load_state_dict(state["average"])
             self.load_state_dict(state)
-            for name in ("step", "instances", "seconds", "best"):
+            for name in PROGRESS:
                 setattr(self, name, state["progress"][name])
             checkpoint.set_random_state(self.rng, state["random"])
         except BrokenExecutor:  # a process that makes labels has died
@@ -144,17 +150,36 @@ class Learner(ABC):
             raise ValueError(f"{path}: it does not hold the state of a {type(self).__name__} ({reason})") from error
 
     def _common_state(self, path: Path) -> dict[str, Any]:
-        """The checkpoint at ``path``, or the one before it if another process has not come as far.
+        """The checkpoint at ``path``. Under torchrun: the newest whole one of a step that all processes have saved.
 
-        Processes that train together are at the same step when they save, but one may be killed before it has saved.
+        Processes that train together are at the same step when they save. But one may be killed before it has saved, or
+        its file may be damaged: then all of them go back to the checkpoint before it.
         """
-        state = checkpoint.read(path)
-        step = torch.tensor([state["progress"]["step"]], device=self.config.device)
-        earliest = int(gather(step).min())
-        if int(step) > earliest and checkpoint.previous(path).is_file():
-            state = checkpoint.read(checkpoint.previous(path))
-        if state["progress"]["step"] != earliest:
-            raise ValueError(f"{path} is of step {int(step)}, but another process has saved step {earliest} last")
+        if world_size() == 1:
+            return checkpoint.read(path)
+        found: dict[int, tuple[Path, dict[str, Any]]] = {}  # by step
+        problems = []
+        for file in (path, checkpoint.previous(path)):
+            try:
+                state = checkpoint.read(file)
+                found.setdefault(int(state["progress"]["step"]), (file, state))
+            except (ValueError, OSError) as error:
+                problems.append(str(error))
+            except (LookupError, TypeError) as error:
+                problems.append(f"{file}: it does not say its step ({type(error).__name__}: {error})")
+        steps = torch.tensor([*found, -1, -1][:2], device=self.config.device)  # -1: none
+        everywhere = gather(steps).view(-1, 2).tolist()  # (number of processes, 2), the same in all of them
+        common = set.intersection(*map(set, everywhere)) - {-1}
+        if not common:
+            raise ValueError(
+                f"{path}: the processes share no whole checkpoint: they have those of steps "
+                f"{[sorted({*steps} - {-1}) for steps in everywhere]} {'; '.join(problems)}"
+            )
+        file, state = found[max(common)]
+        if file != path:
+            reason = problems[0] if problems else "another process has not come as far"
+            print(f"train: {path} is left out, step {max(common)} is continued ({reason})", file=sys.stderr, flush=True)
+            checkpoint.go_back(path)
         return state
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
 
+from mtsp_env.reading import read_file
 from mtsp_env.writing import atomic_write
 
 
@@ -23,6 +24,7 @@ class Logs:
     Raises:
         ImportError: TensorBoard is not installed.
         OSError: a file cannot be written.
+        ValueError: a file that is there already is damaged.
     """
 
     def __init__(self, folder: Path, step: int, tensorboard: bool):
@@ -52,9 +54,12 @@ class Logs:
 
 def _drop_rows_after(step: int, file: Path) -> None:
     """Rewrite a CSV file without the rows of later steps and without a last row that was cut off."""
-    text = file.read_text(encoding="utf-8")
-    rows = [row for row in text.splitlines(keepends=True) if row.endswith("\n")]
-    kept = "".join(row for row in rows if int(row.partition(",")[0]) <= step)
+    try:
+        text = read_file(file).decode("utf-8")
+        rows = [row for row in text.splitlines(keepends=True) if row.endswith("\n")]
+        kept = "".join(row for row in rows if int(row.partition(",")[0]) <= step)
+    except ValueError as error:
+        raise ValueError(f"{file}: damaged, move it away to continue the run ({error})") from error
     if kept != text:
         with atomic_write(file) as temporary:
             temporary.write_text(kept, encoding="utf-8")

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-import signal
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, nullcontext
+from pathlib import Path
 
 from mtsp_env.writing import lock, remove_leftovers
 from train.config import RunConfig
 from train.distributed import any_process, rank
-from train.interrupts import postponed
+from train.interrupts import ENDING, postponed
 from train.learner import Learner, checkpoint_path
 from train.logs import Logs
 from train.progress import progress
@@ -34,14 +34,26 @@ def run_folder(config: RunConfig) -> Iterator[None]:
         _check_unused(config)
         yield
         return
-    config.out.mkdir(parents=True, exist_ok=True)
-    with open(config.out / ".lock", "a") as file:
+    with sole_writer(config.out):
+        _check_unused(config)
+        remove_leftovers(config.out)
+        yield
+
+
+@contextmanager
+def sole_writer(folder: Path) -> Iterator[None]:
+    """A context in which no other process may hold this folder, which is made if it is missing.
+
+    Raises:
+        OSError: the folder cannot be written.
+        ValueError: another process holds it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / ".lock", "a") as file:
         try:
             lock(file)
         except BlockingIOError:
-            raise ValueError(f"{config.out}: another run is writing to it") from None
-        _check_unused(config)
-        remove_leftovers(config.out)
+            raise ValueError(f"{folder}: another run is writing to it") from None
         yield
 
 
@@ -51,14 +63,15 @@ def _check_unused(config: RunConfig) -> None:
 
 
 def run(learner: Learner) -> None:
-    """Train until the configured steps or seconds are over, or until Ctrl-C or SIGTERM; log, and save in any case.
+    """Train until the configured steps or seconds are over, or a signal comes; log, and save in any case.
 
-    A signal that ends the run is raised again after everything is saved, for whoever handled it before.
+    A signal (Ctrl-C, SIGTERM or SIGHUP) that ends the run is raised again after everything is saved, for whoever
+    handled it before.
     """
     with closing(learner):
         if learner.config.resume:
             learner.restore()
-        with postponed(signal.SIGINT, signal.SIGTERM) as caught:
+        with postponed(*ENDING) as caught:
             _train(learner, caught)
 
 
@@ -67,6 +80,7 @@ def _train(learner: Learner, caught: list[int]) -> None:
     config, first = learner.config, rank() == 0
     stop_at = learner.seconds + (config.seconds or math.inf)  # on the run's own clock, which is logged and saved
     logging = closing(Logs(config.out, learner.step, config.tensorboard)) if first else nullcontext()
+    saved = -1  # the step of the last checkpoint
     with progress(config.steps, learner.step, silent=not first) as show, logging as logs:
         while learner.step < config.steps:
             if any_process(bool(caught) or learner.seconds >= stop_at, config.device):
@@ -83,4 +97,6 @@ def _train(learner: Learner, caught: list[int]) -> None:
             show(learner.step, numbers | ({"best": learner.best} if learner.best < math.inf else {}))
             if learner.step % config.checkpoint_every == 0:
                 learner.save()
-        learner.save()
+                saved = learner.step
+        if saved != learner.step:  # saved twice, a step would leave a process that is killed meanwhile two behind
+            learner.save()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -50,14 +51,22 @@ def _lines(total: int) -> Iterator[Show]:
         nonlocal last, due, printed
         last, printed = f"step {step}/{total}  {_format(numbers)}", False
         if time.monotonic() >= due:
-            print(last, file=sys.stderr, flush=True)
+            _print(last)
             due, printed = time.monotonic() + LINE_EVERY, True
 
     try:
         yield show
     finally:
         if not printed:
-            print(last, file=sys.stderr, flush=True)
+            _print(last)
+
+
+def _print(line: str) -> None:
+    """Print to stderr. A run goes on if nobody reads that any more: a pipe or a terminal may be closed."""
+    try:
+        print(line, file=sys.stderr, flush=True)
+    except OSError:
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115 (for whatever else is printed, until the process ends)
 
 
 def _format(numbers: Mapping[str, float]) -> str:

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 
 from pydantic import TypeAdapter, ValidationError
 
+from mtsp_env.reading import read_file
 from train.config import RunConfig
 from train.imitate import ImitationLearner
 from train.improve import ImproveLearner
@@ -79,7 +80,7 @@ def read_recipe(file: Path) -> list[Stage]:
         ValueError: it is not TOML, or something in it is unknown, missing or out of range.
     """
     try:
-        recipe = tomllib.loads(file.read_text(encoding="utf-8"))
+        recipe = tomllib.loads(read_file(file).decode("utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{file}: not a TOML file ({error})") from error
     _check_keys(str(file), recipe, required=("stages",), optional=("shared",))

@@ -21,7 +21,7 @@ from mtsp_env.files import atomic_write, write_json
 from train import checkpoint
 from train.config import RunConfig
 from train.learner import Learner, checkpoint_path
-from train.loop import run, run_folder
+from train.loop import run, run_folder, sole_writer
 from train.recipe import COMMANDS, PREVIOUS, Stage, read_recipe
 from train.supervised_config import ImitateConfig
 
@@ -83,26 +83,30 @@ def recipe(
         FileExistsError: ``out`` holds another run and ``resume`` is not set.
         ModuleNotFoundError: Numba, which `imitate` needs, is not installed.
         OSError: there is no run to resume, or no such weights.
-        ValueError: the recipe or an argument does not fit, or the run to resume had another configuration.
+        ValueError: the recipe or an argument does not fit, the run to resume had another configuration or its files are
+            damaged, or another process trains in ``out``.
     """
     end = math.inf if seconds is None else time.monotonic() + seconds
     stages = read_recipe(file)
     _check_arguments(stages, resume, init, from_stage, seconds)
     _check_requirements(stages)
-    log = _read_log(out, stages) if resume else _begin(file, stages, out, init, from_stage)
-
-    weights = out / GIVEN  # what the next stage starts from
-    for stage, record in zip(stages, log.stages, strict=True):
-        if record.status in ("waiting", "under way"):
-            left = end - time.monotonic()
-            if left <= 0:
-                break
-            config = _located(stage, out, weights, log.from_stage, device, threads)
-            _train(stage, config, record, left, lambda: _write_log(out, log))
-            if record.status != "complete":
-                break
-        if record.weights is not None:
-            weights = out / record.weights
+    if resume and not (out / LOG).is_file():
+        raise FileNotFoundError(f"no run to resume at {out / LOG}")
+    given = None if init is None else find(init).read_bytes()
+    with sole_writer(out):
+        log = _read_log(out, stages) if resume else _begin(file, stages, out, given, from_stage)
+        weights = out / GIVEN  # what the next stage starts from
+        for stage, record in zip(stages, log.stages, strict=True):
+            if record.status in ("waiting", "under way"):
+                left = end - time.monotonic()
+                if left <= 0:
+                    break
+                config = _located(stage, out, weights, log.from_stage, device, threads)
+                _train(stage, config, record, left, lambda: _write_log(out, log))
+                if record.status != "complete":
+                    break
+            if record.weights is not None:
+                weights = out / record.weights
     return log
 
 
@@ -132,13 +136,11 @@ def _check_requirements(stages: Sequence[Stage]) -> None:
             import mtsp_env.reference  # noqa: F401 (the teacher needs Numba)
 
 
-def _begin(file: Path, stages: Sequence[Stage], out: Path, init: str | None, from_stage: str | None) -> Log:
-    """A new run in ``out``."""
+def _begin(file: Path, stages: Sequence[Stage], out: Path, given: bytes | None, from_stage: str | None) -> Log:
+    """A new run in ``out``; ``given``: the weights that ``from_stage`` starts from."""
     if (out / LOG).exists():
         raise FileExistsError(f"{out} holds a run already: add --resume to continue it, or choose another --out")
-    given = None if init is None else find(init).read_bytes()
     log = Log(str(file), from_stage, [Record(stage.name, stage.command) for stage in stages])
-    out.mkdir(parents=True, exist_ok=True)
     if given is not None:
         with atomic_write(out / GIVEN) as temporary:
             temporary.write_bytes(given)
@@ -153,8 +155,6 @@ def _begin(file: Path, stages: Sequence[Stage], out: Path, init: str | None, fro
 def _read_log(out: Path, stages: Sequence[Stage]) -> Log:
     """The log of the run in ``out``."""
     path = out / LOG
-    if not path.is_file():
-        raise FileNotFoundError(f"no run to resume at {path}")
     try:
         log = TypeAdapter(Log).validate_json(path.read_bytes(), extra="forbid")
     except ValidationError as error:
@@ -189,7 +189,7 @@ def _train(stage: Stage, config: RunConfig, record: Record, left: float, write_l
     """Train one stage from its beginning or its checkpoint for at most ``left`` seconds, and record how it goes."""
     budget = config.seconds or math.inf
     resume = checkpoint_path(config).exists()
-    spent = checkpoint.read(checkpoint_path(config))["progress"]["seconds"] if resume else 0.0
+    spent = checkpoint.seconds(checkpoint_path(config)) if resume else 0.0
     seconds = min(left, max(budget - spent, 0.0))
     config = replace(config, resume=resume, seconds=seconds if 0 < seconds < math.inf else None)
     print(f"stage {stage.name}: {'continues' if resume else f'starts from {config.init}'}", file=sys.stderr, flush=True)

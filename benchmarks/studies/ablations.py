@@ -25,6 +25,8 @@ from dan_policy.episode import Decode, rollout
 from dan_policy.joint import JointConfig
 from dan_policy.planning import SPEED
 from mtsp_env.batched import BatchedMTSP
+from mtsp_env.checks import check_seconds
+from mtsp_env.files import read_json
 from mtsp_env.tours import makespan
 from train import checkpoint
 from train.config import RunConfig
@@ -111,10 +113,10 @@ def main(
         out: file for the table in Markdown; by default the study's file in benchmarks/results.
 
     Raises:
-        ValueError: ``minutes`` is not above 0, there are no seeds, or ``folder`` has results of runs of another length.
+        ValueError: ``minutes`` is not a finite number above 0, there are no seeds, or ``folder`` has damaged results or
+            those of runs of another length.
     """
-    if not minutes > 0:
-        raise ValueError(f"minutes must be above 0, got {minutes!r}")
+    check_seconds("minutes", minutes, unit="minutes")
     if not seeds:
         raise ValueError("name at least one seed")
     results = []
@@ -138,7 +140,7 @@ def _result(variant: Variant, minutes: float, seed: int, folder: Path) -> dict[s
         with ProcessPoolExecutor(1, spawn) as pool:
             result = pool.submit(train_and_evaluate, variant, 60 * minutes, seed, folder).result()
         write_text(file, json.dumps({"minutes": minutes, "seed": seed} | asdict(variant) | result))
-    result = json.loads(file.read_text(encoding="utf-8"))
+    result = read_json(file, keys=("minutes", "seed", "name"))
     if (result["minutes"], result["seed"], result["name"]) != (minutes, seed, variant.name):
         raise ValueError(f"{file} belongs to another run: {result['name']!r}, {result['minutes']:g} minutes")
     return result

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from benchmarks.files import write_text
 from benchmarks.harness.machine import describe_machine
 from benchmarks.reports.plots import save
+from mtsp_env.checks import check_seconds
 from mtsp_env.instance import Instance
 from mtsp_env.reference import improve_batch
 from mtsp_env.tours import makespan
@@ -40,10 +41,9 @@ def main(minutes: float = 30.0, folder: Path = Path("runs/curves"), out: Path = 
         out: folder for curves.csv and curves.png.
 
     Raises:
-        ValueError: ``minutes`` is not above 0.
+        ValueError: ``minutes`` is not a finite number above 0, or a run in ``folder`` is damaged.
     """
-    if not minutes > 0:
-        raise ValueError(f"minutes must be above 0, got {minutes!r}")
+    check_seconds("minutes", minutes, unit="minutes")
     common = SETTING | {"threads": 1, "tensorboard": False, "network": QUICK.network, "steps": 10**9}
     runs = {
         "REINFORCE from scratch": (reinforce, replace(QUICK, out=folder / "reinforce", validate_every=10, **common)),
@@ -51,8 +51,8 @@ def main(minutes: float = 30.0, folder: Path = Path("runs/curves"), out: Path = 
     }
     curves = {}
     for name, (train, config) in runs.items():
-        exists = config.out.exists()
-        left = 60 * minutes - (checkpoint.read(checkpoint_path(config))["progress"]["seconds"] if exists else 0.0)
+        exists = checkpoint_path(config).exists()
+        left = 60 * minutes - (checkpoint.seconds(checkpoint_path(config)) if exists else 0.0)
         if left > 0:
             train(replace(config, seconds=left, resume=exists))
         curves[name] = read(config.out)

@@ -13,6 +13,7 @@ from scipy.stats import sem
 from benchmarks import solvers
 from benchmarks.reports.markdown import markdown_table
 from benchmarks.suite import SEED, Cell
+from mtsp_env.checks import check_count, check_seconds
 from mtsp_env.instance import Instance, Tours
 from mtsp_env.tours import check_tours, lower_bound, makespan
 
@@ -63,7 +64,13 @@ def main(instances: int = 5, seconds: tuple[float, ...] = (0.1, 1.0, 5.0), seed:
         instances: number of instances of each size, at least 2.
         seconds: budgets of the solvers.
         seed: seed of the instances.
+
+    Raises:
+        ValueError: an argument outside its range.
     """
+    check_count("instances", instances, minimum=2)
+    for budget in seconds:
+        check_seconds("seconds", budget)
     methods = {"reference": solvers.find("reference"), "PyVRP": pyvrp, "OR-Tools": solvers.find("ortools-gls")}
     lines = []
     for n, m in ((50, 5), (100, 5), (200, 10)):

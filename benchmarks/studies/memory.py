@@ -6,6 +6,7 @@ and at the end; the difference is the growth.
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import resource
 import sys
@@ -120,6 +121,8 @@ def main(share: float = 1.0, cases: tuple[str, ...] = tuple(CASES)) -> None:
     for name in cases:
         if name not in CASES:
             raise ValueError(f"unknown case {name!r}; choose from {list(CASES)}")
+        if not 0 < share < math.inf:
+            raise ValueError(f"share must be a finite number above 0, got {share!r}")
         rounds = int(share * CASES[name][1])
         check_count(f"rounds of {name!r}", rounds, 10)
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:

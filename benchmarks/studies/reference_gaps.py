@@ -21,9 +21,11 @@ from benchmarks.harness.machine import describe_machine
 from benchmarks.reports.markdown import markdown_table
 from benchmarks.suite import SEED, Cell
 from mtsp_env.checks import check_count, check_seconds
+from mtsp_env.files import read_json
 from mtsp_env.instance import Tours
 from mtsp_env.reference import compile_kernels, improve
 from mtsp_env.tours import lower_bound, makespan
+from mtsp_env.writing import alone_in
 
 REPORT = Path(__file__).parents[1] / "results" / "reference-gaps.md"
 
@@ -172,7 +174,7 @@ def run_long(cell: Cell, seed: int, seconds: float, workers: int, long_runs: Pat
     for i, tours in _in_threads(run, jobs, workers, f"{cell.label}: long runs"):
         best_known.merge(cell, seed, {i: tours}, folder)
         longest[i] = seconds
-        write_text(long_runs, json.dumps({**_read_json(long_runs), f"{cell.label}-seed{seed}": longest}))
+        _update_json(long_runs, f"{cell.label}-seed{seed}", longest)
 
 
 def run_sample(cell: Cell, seed: int, seconds: float, count: int, workers: int, file: Path, folder: Path) -> None:
@@ -194,7 +196,7 @@ def run_sample(cell: Cell, seed: int, seconds: float, count: int, workers: int, 
     for i, tours in _in_threads(run, jobs, workers, f"{cell.label}: {seconds:g} s"):
         best_known.merge(cell, seed, {i: tours}, folder)
         reduction[str(i)] = max(0.0, 1.0 - makespan(instances[i], tours) / cost[i])
-        write_text(file, json.dumps({**_read_json(file), key: reduction}))
+        _update_json(file, key, reduction)
 
 
 def _in_threads(
@@ -300,5 +302,12 @@ def _longest_runs(file: Path, cell: Cell, seed: int) -> list[float]:
     return longest + [0.0] * (cell.count - len(longest))
 
 
+def _update_json(path: Path, key: str, value: object) -> None:
+    """Set one entry of a file; processes that do so at the same time wait for one another."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with alone_in(path.parent):
+        write_text(path, json.dumps({**_read_json(path), key: value}))
+
+
 def _read_json(path: Path) -> dict:
-    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    return read_json(path, keys=()) if path.exists() else {}

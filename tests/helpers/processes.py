@@ -21,7 +21,7 @@ def children(pid: int) -> list[int]:
     return [child.pid for child in psutil.Process(pid).children()]
 
 
-def wait_until(condition: Callable[[], object], seconds: float = 120.0) -> None:
+def wait_until(condition: Callable[[], object], seconds: float = 300.0) -> None:
     """Return as soon as the condition holds; an AssertionError if it does not within this time."""
     end = time.monotonic() + seconds
     while not condition():
