@@ -12,6 +12,7 @@ from typing import Literal
 
 from mtsp_env import reference
 from mtsp_env.instance import Instance, Tours, from_coordinates
+from mtsp_env.processes import end_with_parent
 
 Method = Literal["reference", "dan"]
 NICENESS = 5  # of the planning processes: the one that answers goes first
@@ -77,6 +78,7 @@ def plan(
 
 def _prepare(policy: str | None) -> None:
     global _policy
+    end_with_parent()
     os.nice(NICENESS)
     reference.compile_kernels()
     if policy is not None:

@@ -158,10 +158,14 @@ def test_curves_are_trained_until_their_time_is_over(small, tmp_path, monkeypatc
 
 @pytest.mark.slow
 def test_curves_that_were_killed_before_their_first_checkpoint_are_begun_again(small, tmp_path, monkeypatch):
+    often = {"validate_every": 1, "steps": 2}
+    reinforce, imitate = curves.reinforce, curves.imitate
     monkeypatch.setattr(curves, "QUICK", replace(QUICK, batch_size=4, challenge_instances=4))
+    monkeypatch.setattr(curves, "reinforce", lambda config: reinforce(replace(config, **often)))
+    monkeypatch.setattr(curves, "imitate", lambda config: imitate(replace(config, set_tokens=64, **often)))
     for name in ("reinforce", "imitate"):
         (tmp_path / "runs" / name / "logs").mkdir(parents=True)
-    curves.main(0.001, tmp_path / "runs", tmp_path)
+    curves.main(0.1, tmp_path / "runs", tmp_path)
     assert (tmp_path / "curves.csv").exists()
 
 

@@ -6,13 +6,17 @@ import asyncio
 import json
 import multiprocessing
 import re
+import subprocess
+import sys
 import threading
 import time
 from collections import deque
 from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 pytest.importorskip("fastapi", reason="needs the extra serve")
@@ -20,12 +24,14 @@ pytest.importorskip("numba", reason="needs the extra serve")
 httpx = pytest.importorskip("httpx", reason="sends the requests")
 
 from command import refused  # noqa: E402
+from helpers.processes import alive, children, wait_until  # noqa: E402
 
 from dan_policy.queueing import LEAST_SECONDS, Late, PlanQueue, fair_share  # noqa: E402
 from dan_policy.service import Limits, create_app  # noqa: E402
 from dan_policy.workers import Workers  # noqa: E402
 from mtsp_env import Instance, check_tours, reference  # noqa: E402
 
+ROOT = Path(__file__).parent.parent
 LIMITS = Limits(nodes=60, agents=8, seconds=5.0, waiting=120, plans=1)
 GOOD: dict[str, Any] = {"nodes": [[0, 0], [30, 40], [-30, 40], [0, 80]], "n_agents": 2, "seconds": 5.0}
 
@@ -292,6 +298,23 @@ def test_bad_limits(change: dict, message: str) -> None:
 def test_bad_options_of_the_command(capsys: pytest.CaptureFixture) -> None:
     assert "--port: must be at most 65535, got 65536" in refused(capsys, "serve", "--port", "65536")
     assert "--max-nodes: must be a whole number of at least 2" in refused(capsys, "serve", "--max-nodes", "1")
+
+
+@pytest.mark.slow
+def test_a_plan_under_way_ends_with_a_service_that_is_killed() -> None:
+    code = (
+        "import numpy as np; from dan_policy.workers import Workers; from mtsp_env import uniform\n"
+        "workers = Workers(1, None); print('ready', flush=True)\n"
+        "workers(uniform(np.random.default_rng(0), 200, 5), 'reference', 1000.0, 0, None)"
+    )
+    service = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert service.stdout is not None and service.stdout.readline() == "ready\n"
+    processes = [psutil.Process(pid) for pid in children(service.pid)]
+    before = sum(process.cpu_times().user for process in processes)
+    wait_until(lambda: sum(process.cpu_times().user for process in processes) > before + 0.5)  # the plan is under way
+    service.kill()
+    service.wait()
+    wait_until(lambda: not any(alive(process.pid) for process in processes))
 
 
 @pytest.mark.slow

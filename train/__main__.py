@@ -21,9 +21,10 @@ from dan_policy.arguments import (
 )
 
 if __name__ == "__main__":
-    try:
+    try:  # what follows cannot be imported otherwise
         check_docstrings()
-    except ImportError as error:
+        check_working_directory()
+    except (ImportError, OSError) as error:
         refuse(str(error), "train")
 
 # Number of kernels that oneDNN caches; PyTorch reads it when it is loaded. Batches have many shapes, and building a

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from dan_policy.actor import Key
 from dan_policy.registry import find
+from mtsp_env.processes import end_with_parent
 from train.demonstrations import Demonstrations, as_decisions, demonstrate
 from train.interrupts import ENDING
 from train.plans import PLAN_KEYS, add_plans
@@ -144,7 +145,7 @@ def _set_up_worker() -> None:
     A terminal or a job scheduler sends its signals to all processes of a run. The learning process decides what they
     mean, and still needs labels to finish its step.
     """
-    Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
     if hasattr(signal, "sigwaitinfo"):
         Thread(target=_end_on_parents_signal, daemon=True).start()
     else:  # macOS does not say who sent a signal, and the pool ends its workers by SIGTERM if one of them has died
@@ -160,10 +161,3 @@ def _end_on_parents_signal() -> None:
         received = signal.sigwaitinfo(ENDING)
         if received.si_signo == signal.SIGTERM and received.si_pid == os.getppid():
             os._exit(1)
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None  # this runs in a worker
-    parent.join()
-    os._exit(1)

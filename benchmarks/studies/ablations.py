@@ -27,6 +27,7 @@ from dan_policy.planning import SPEED
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.checks import check_seconds
 from mtsp_env.files import read_json
+from mtsp_env.processes import end_with_parent
 from mtsp_env.tours import makespan
 from train import checkpoint
 from train.config import RunConfig
@@ -137,7 +138,7 @@ def _result(variant: Variant, minutes: float, seed: int, folder: Path) -> dict[s
     if not file.exists():
         print(f"{variant.name}, seed {seed}: {minutes:g} minutes", flush=True)
         spawn = multiprocessing.get_context("spawn")  # a process for each: memory left by one slows no other
-        with ProcessPoolExecutor(1, spawn) as pool:
+        with ProcessPoolExecutor(1, spawn, end_with_parent) as pool:
             result = pool.submit(train_and_evaluate, variant, 60 * minutes, seed, folder).result()
         write_text(file, json.dumps({"minutes": minutes, "seed": seed} | asdict(variant) | result))
     result = read_json(file, keys=("minutes", "seed", "name"))

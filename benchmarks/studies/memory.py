@@ -25,6 +25,7 @@ from rich.table import Table
 
 from benchmarks.studies.timing import machine_title
 from mtsp_env.checks import check_count
+from mtsp_env.processes import end_with_parent
 
 WARM_UP = 0.1  # share of the rounds before the first reading
 
@@ -125,7 +126,7 @@ def main(share: float = 1.0, cases: tuple[str, ...] = tuple(CASES)) -> None:
             raise ValueError(f"share must be a finite number above 0, got {share!r}")
         rounds = int(share * CASES[name][1])
         check_count(f"rounds of {name!r}", rounds, 10)
-        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), end_with_parent) as pool:
             memory = pool.submit(measure, name, rounds).result()
         sizes = (memory.warm, memory.end, memory.end - memory.warm, memory.peak)
         table.add_row(str(rounds), name, *(f"{size / 2**20:,.1f}" for size in sizes), f"{memory.seconds:.0f}")

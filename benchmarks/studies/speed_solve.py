@@ -15,6 +15,7 @@ from benchmarks.studies.timing import machine_title
 from benchmarks.suite import SEED, Cell
 from dan_policy import solve
 from dan_policy.episode import Decode
+from mtsp_env.processes import end_with_parent
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ def speed_table(threads: tuple[int, ...] = (1, 2), repeats: int = 5) -> Table:
     spawn = multiprocessing.get_context("spawn")
     for case in CASES:
         for count in threads:
-            with ProcessPoolExecutor(1, spawn) as pool:
+            with ProcessPoolExecutor(1, spawn, end_with_parent) as pool:
                 cost = pool.submit(measure, case, count, repeats).result()
             target = "" if case.target is None else f"{case.target:g}"
             memory = [f"{size / 2**20:,.0f}" for size in (cost.memory, cost.memory_before)]
