@@ -183,8 +183,10 @@ def seed_of(table: str, seed: int | None = None) -> int:
     """The seed of a table's instances: ``seed``, or by default the table's own.
 
     Raises:
-        ValueError: another seed than 3333 for the public test set.
+        ValueError: a negative seed, or another one than 3333 for the public test set.
     """
+    if seed is not None:
+        check_count("seed", seed, minimum=0)
     if table != "seed3333":
         return SEED if seed is None else seed
     if seed not in (None, PUBLIC_SEED):

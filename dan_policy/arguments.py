@@ -75,7 +75,8 @@ def open_streams() -> None:
     """Let what is printed vanish if the process was started without a standard output or error (``>&-``).
 
     The next files that such a process opens would take the places of its standard streams, and everything that prints
-    there, such as a library in C, would write into them: /dev/null takes the places.
+    there, such as a library in C, would write into them: /dev/null takes the places. Where only some letters can be
+    printed, such as ASCII, a question mark takes the place of the others.
     """
     for descriptor in range(3):
         try:
@@ -85,6 +86,8 @@ def open_streams() -> None:
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115 (open until the process ends)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
 
 
 def check_docstrings() -> None:
@@ -150,6 +153,13 @@ def deferred(command: Command) -> Callable[..., Callable[[], Any]]:
 
 
 def _without_box(report: str) -> str:
-    """The message inside the box that tyro draws: the lines between its title and its first ruler."""
+    """The message inside the box that tyro draws: the lines between its title and its first ruler.
+
+    Where only ASCII can be printed, there is no box, and another ruler below the title.
+    """
+
+    def is_ruler(line: str) -> bool:
+        return len(line) > 1 and not line.strip("─-")
+
     lines = [line.strip("│╭╮╰╯ ") for line in report.splitlines()[1:]]
-    return " ".join(itertools.takewhile(lambda line: line == "" or line.strip("─"), lines))
+    return " ".join(itertools.takewhile(lambda line: not is_ruler(line), itertools.dropwhile(is_ruler, lines)))

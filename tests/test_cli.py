@@ -1,6 +1,8 @@
 """The command ``mtsp``: what it prints and writes; every bad input gives one line and exit code 2."""
 
+import io
 import json
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -350,6 +352,18 @@ def test_version_and_help(capsys) -> None:
         assert caught.value.code == 0
         out = capsys.readouterr().out
         assert out == f"mtsp {__version__}\n" if argv == ["--version"] else "example" in out
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
+def test_a_bad_option_is_one_line_in_any_language(capsys, monkeypatch, encoding: str) -> None:
+    """tyro draws its boxes with the letters that can be printed."""
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding))
+    assert refused(capsys, "solve", "a.json", "--agents", "x") == (
+        "mtsp: error: Error parsing --agents: must be a whole number from 1 to 100000, got 'x'\n"
+    )
+    print("± 1")
+    sys.stdout.flush()
+    assert sys.stdout.buffer.getvalue().decode(encoding) == ("± 1\n" if encoding == "utf-8" else "? 1\n")
 
 
 def test_no_command_or_an_unknown_one(capsys) -> None:

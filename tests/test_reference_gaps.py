@@ -193,6 +193,7 @@ def test_a_damaged_list_of_long_runs_is_named(monkeypatch, places) -> None:
     [
         ({"instances": 1}, "instances must be a whole number of at least 2, got 1"),
         ({"workers": 0}, "workers must be a whole number of at least 1, got 0"),
+        ({"seed": -1}, "seed must be a whole number of at least 0, got -1"),
         ({"sample": 1}, "sample must be 0 or at least 2, got 1"),
         ({"sample": -2}, "sample must be a whole number of at least 0, got -2"),
         ({"sample": 2, "sample_seconds": 0.0}, "sample_seconds must be a finite number of seconds above 0, got 0.0"),

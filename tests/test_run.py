@@ -242,6 +242,11 @@ def test_table_3_is_measured_rounded_and_not(tmp_path):
         run("3", tmp_path / "rows.jsonl", ("nearest",))
 
 
+def test_times_may_be_longer_than_a_machine_can_wait(tmp_path):
+    times = {"limit": 1e30, "grace": 1e30, "warm_up": 1e30, "seconds": (1e30,)}
+    assert measure(tmp_path, "deals", **times)["deals"].ok
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -254,6 +259,7 @@ def test_table_3_is_measured_rounded_and_not(tmp_path):
         (["--table", "3", "--instances", "2"], "table 3 has 1 instance in each cell, got instances = 2"),
         (["--cells", "9x9"], "unknown cell '9x9'; choose from ['8x2']"),
         (["--seconds", "0"], "seconds must be a finite number of seconds above 0, got 0.0"),
+        (["--seed=-1"], "seed must be a whole number of at least 0, got -1"),
         (["--grace", "nan"], "grace must be a finite number of seconds above 0, got nan"),
         (["--workers", "0"], "workers must be a whole number of at least 1, got 0"),
         (["--workers", "100000"], "the number of cores, got 100000"),

@@ -80,6 +80,9 @@ def test_a_damaged_checkpoint_can_be_replaced_by_the_one_before_it(tmp_path):
     path.write_bytes(data)
     with pytest.raises(ValueError, match=r"its checksum does not fit.*: mv "):
         reinforce(replace(run, resume=True))
+    path.unlink()
+    with pytest.raises(FileNotFoundError, match=r"no checkpoint at .*: mv .*previous\.pt .*checkpoint\.pt"):
+        reinforce(replace(run, resume=True))
     checkpoint.previous(path).replace(path)
     assert checkpoint.read(path)["progress"]["step"] == 4
     reinforce(replace(run, resume=True))

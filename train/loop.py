@@ -9,6 +9,7 @@ from contextlib import closing, contextmanager, nullcontext
 from pathlib import Path
 
 from mtsp_env.writing import lock, remove_leftovers
+from train import checkpoint
 from train.config import RunConfig
 from train.distributed import any_process, rank
 from train.interrupts import ENDING, postponed
@@ -29,7 +30,9 @@ def run_folder(config: RunConfig) -> Iterator[None]:
     """
     path = checkpoint_path(config)
     if config.resume and not path.exists():
-        raise FileNotFoundError(f"no checkpoint at {path}")
+        before = checkpoint.previous(path)
+        hint = f"; to continue from the one before it: mv {before} {path}" if before.is_file() else ""
+        raise FileNotFoundError(f"no checkpoint at {path}{hint}")
     if rank():  # under torchrun, process 0 holds the lock for all
         _check_unused(config)
         yield

@@ -21,6 +21,7 @@ from benchmarks.harness.jobs import Job, Limits
 from benchmarks.harness.processes import kill_descendants
 from benchmarks.harness.worker import READY
 
+LONGEST_WAIT = 3600.0  # seconds; operating systems cannot wait for any time
 ONE_THREAD = {
     name: "1"
     for name in (
@@ -47,7 +48,8 @@ def run_jobs(jobs: Sequence[Job], limits: Limits, cores: Sequence[int]) -> Itera
             if not busy:
                 return
             deadline = min(worker.deadline for worker in busy)
-            wait([worker.connection for worker in busy], timeout=max(deadline - time.monotonic(), 0.0))
+            left = min(max(deadline - time.monotonic(), 0.0), LONGEST_WAIT)
+            wait([worker.connection for worker in busy], timeout=left)
             for worker in busy:
                 job, outcome = worker.job, worker.poll()
                 if outcome is not None:

@@ -69,6 +69,7 @@ def main(instances: int = 5, seconds: tuple[float, ...] = (0.1, 1.0, 5.0), seed:
         ValueError: an argument outside its range.
     """
     check_count("instances", instances, minimum=2)
+    check_count("seed", seed, minimum=0)
     for budget in seconds:
         check_seconds("seconds", budget)
     methods = {"reference": solvers.find("reference"), "PyVRP": pyvrp, "OR-Tools": solvers.find("ortools-gls")}

@@ -128,6 +128,7 @@ def main(
     """
     check_count("instances", instances, minimum=2)
     check_count("workers", workers, minimum=1)
+    check_count("seed", seed, minimum=0)
     by_label = {target.label: target for target in TARGETS}
     if unknown := [label for label in cells if label not in by_label]:
         raise ValueError(f"unknown cell {unknown[0]!r}; choose from {list(by_label)}")
