@@ -2,15 +2,20 @@
 
 import gzip
 import json
+from dataclasses import asdict
 
 import pytest
 from made_up import one_agent_does_it_all
 
 from benchmarks import best_known, suite
 from benchmarks.__main__ import main
-from benchmarks.leaderboard import board, submission, test_sets
+from benchmarks.harness.world_rows import Row
+from benchmarks.leaderboard import board, submission, test_sets, worlds
 from benchmarks.leaderboard.board import leaderboard
-from mtsp_env import makespan
+from benchmarks.studies.worlds import Cell
+from mtsp_env import check_log, makespan
+from mtsp_env.instance import batch
+from mtsp_env.log import write_log
 
 CELL = suite.cells("smoke")[0]
 INSTANCES = CELL.instances(suite.SEED)
@@ -23,6 +28,7 @@ def tiny(tmp_path, monkeypatch):
     for module in (board, test_sets):
         monkeypatch.setattr(module, "TEST_SETS", {"tiny": test_sets.TestSet("smoke", "Tiny", "Three instances.", ())})
     monkeypatch.setattr(board, "SUBMISSIONS", tmp_path / "submissions")
+    monkeypatch.setattr(worlds.measured, "__defaults__", (tmp_path / "no rows",))
     for function in (best_known.merge_rows, board.collect):
         monkeypatch.setattr(function, "__defaults__", (None, tmp_path / "best"))
     return tmp_path
@@ -84,7 +90,7 @@ MISSING = [*HALVES[:2], [[0, 1, 2, 3, 0], [0, 4, 5, 6, 0]]]
         (entry(HALVES[:2]), "8x2 has 3 instances, got the tours of 2"),
         (entry(cells={}), "no cells"),
         (entry(cells={"9x2": {"seconds": 1, "tours": HALVES}}), "test set 'tiny' has no cell '9x2'"),
-        (entry(test_set="huge"), "unknown test set 'huge'; choose from ['tiny']"),
+        (entry(test_set="huge"), "unknown test set 'huge'; choose from ['tiny', 'worlds']"),
         (entry(knows="the future"), "Invalid enum value 'the future'"),
         (entry(method="a | b"), "$.method"),
         (entry(by=""), "$.by"),
@@ -142,6 +148,52 @@ def test_submit_needs_one_way_to_plan(tmp_path, capsys):
         assert main(["submit", *options, *about]) == 2
         assert "--policy" in (error := capsys.readouterr().err) or "--seconds" in error
     assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def few_worlds(monkeypatch, tmp_path):
+    """Two games of one cell, and the baseline's rows of them."""
+    cell = Cell("everything", 8, 2)
+    monkeypatch.setattr(worlds, "COUNT", 2)
+    monkeypatch.setattr(worlds, "cells", lambda: {"everything 8x2": cell})
+    monkeypatch.setattr(worlds.measured, "__defaults__", (tmp_path / "rows",))
+    rows = [Row("everything", "8x2", k, "replanner-50", 2.0, False, 9, None, None, None, {}) for k in range(2)]
+    (tmp_path / "rows").mkdir()
+    (tmp_path / "rows" / "rows.jsonl").write_text("".join(f"{json.dumps(asdict(row))}\n" for row in rows))
+    return cell
+
+
+def test_games_in_worlds_are_played_again(tmp_path, few_worlds):
+    out, page = tmp_path / "mine.json", tmp_path / "page.md"
+    about = ["--method", "M", "--by", "B", "--test-set", "worlds", "--out", str(out)]
+    assert main(["submit", "--policy", "default", *about]) == 0
+    played = submission.read(out)
+    costs = [row.makespan for row in worlds.judge_submission(played)]
+    for number, (decisions, cost) in enumerate(zip(played.cells["everything 8x2"].decisions, costs, strict=True)):
+        instance, game_rules = few_worlds.instance(number), few_worlds.rules
+        log = write_log(batch([instance]), game_rules, decisions, close=True)
+        assert cost == check_log(instance, log, game_rules.speed)
+    leaderboard((out,), add=True, out=page)
+    (line,) = lines_of(page.read_text(), "M | B | observation")
+    assert f"{sum(50 * (cost - 2) for cost in costs) / 2:.1f} ±" in line
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda games: games.pop(), "everything 8x2 has 2 instances, got the decisions of 1"),
+        (lambda games: games[1].clear(), "everything 8x2, instance 1: expected 1 to 200 nodes from 0 to 7"),
+        (lambda games: games[1].append(8), "everything 8x2, instance 1: expected 1 to 200 nodes from 0 to 7"),
+        (lambda games: games[0].__delitem__(slice(4, None)), "everything 8x2, instance 0: "),
+    ],
+)
+def test_games_that_break_a_rule_are_refused(tmp_path, few_worlds, change, message):
+    out = tmp_path / "mine.json"
+    main(["submit", "--policy", "default", "--method", "M", "--by", "B", "--test-set", "worlds", "--out", str(out)])
+    played = submission.read(out)
+    change(played.cells["everything 8x2"].decisions)
+    with pytest.raises(ValueError, match=message):
+        worlds.judge_submission(played)
 
 
 @pytest.mark.slow

@@ -11,9 +11,9 @@ from benchmarks import best_known, suite
 from benchmarks.files import write_text
 from benchmarks.harness.judge import read_judged
 from benchmarks.harness.rows import Row
-from benchmarks.leaderboard import submission
+from benchmarks.leaderboard import submission, worlds
 from benchmarks.leaderboard.submission import Submission
-from benchmarks.leaderboard.test_sets import TEST_SETS
+from benchmarks.leaderboard.test_sets import TEST_SETS, WORLDS
 from benchmarks.reports.markdown import markdown_table
 from benchmarks.reports.statistics import Mean, Results, collect, mean
 from benchmarks.reports.tables import published_gaps
@@ -69,24 +69,27 @@ def leaderboard(submissions: tuple[Path, ...] = (), /, add: bool = False, out: P
     if add:
         for path, (entry, rows) in judged.items():
             submission.write(SUBMISSIONS / f"{path.name.removesuffix('.gz').removesuffix('.json')}.json.gz", entry)
-            text += best_known.merge_rows(rows)
+            text += [] if entry.test_set == WORLDS else best_known.merge_rows(rows)
     if add or not submissions:
         write_text(out, page())
         text.append(str(out))
     return "\n\n".join(text)
 
 
-def judge_file(path: Path) -> tuple[Submission, list[Row]]:
-    """Read and judge a submission. Raises OSError or ValueError, whose message names the file."""
+def judge_file(path: Path) -> tuple[Submission, list]:
+    """Read and judge a submission: its rows. Raises OSError or ValueError, whose message names the file."""
     entry = submission.read(path)
     try:
-        return entry, submission.judge(entry)
+        return entry, (worlds.judge_submission if entry.test_set == WORLDS else submission.judge)(entry)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
 
 def _summary(entry: Submission, rows: Sequence[Row]) -> str:
     """The gaps of one submission, as a table."""
+    if entry.test_set == WORLDS:
+        table = worlds.table([*worlds.measured(), *rows], {entry.method: entry})
+        return f"{entry.method} by {entry.by}, test set {entry.test_set}\n\n{table}"
     (results,) = collect(rows)
     (label,) = results.labels
     lines = [
@@ -113,7 +116,7 @@ def page() -> str:
         ValueError: a damaged or wrong file, or two submissions of one name.
     """
     judged = [judge_file(path) for path in sorted(SUBMISSIONS.glob("*.json*"))]
-    sections = [(HERE / "introduction.md").read_text(encoding="utf-8").rstrip()]
+    sections = [_text("introduction.md")]
     for name, test_set in TEST_SETS.items():
         files = [RESULTS / file for file in test_set.files]
         rows = [row for row in read_judged(files) if row.table == test_set.table]
@@ -125,9 +128,22 @@ def page() -> str:
                     raise ValueError(f"two submissions of {label}, test set {name}: give them different names")
                 about[label] = About(entry.method, entry.by, entry.knows, entry.link)
                 rows += submission.with_label(theirs, label)
-        (results,) = collect(rows)
-        sections.append(f"## {test_set.title}\n\n{test_set.text}\n\n{_table(results, about)}")
-    return "\n\n".join(sections) + "\n"
+        for results in collect(rows):  # one, or none if the test set has no rows
+            sections.append(f"## {test_set.title}\n\n{test_set.text}\n\n{_table(results, about)}")
+    games, entries = worlds.measured(), {}
+    for entry, theirs in judged:
+        if entry.test_set == WORLDS:
+            if entry.method in entries:
+                raise ValueError(f"two submissions of {entry.method}, test set worlds: give them different names")
+            entries[entry.method] = entry
+            games += theirs
+    if games:
+        sections.append(f"## {worlds.TITLE}\n\n{worlds.TEXT}\n\n{worlds.table(games, entries)}")
+    return "\n\n".join([*sections, _text("submit.md")]) + "\n"
+
+
+def _text(name: str) -> str:
+    return (HERE / name).read_text(encoding="utf-8").rstrip()
 
 
 def _about_measured(rows: Iterable[Row]) -> dict[str, About]:

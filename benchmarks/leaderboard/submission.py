@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import math
 import zlib
 from dataclasses import replace
 from pathlib import Path
@@ -21,9 +20,10 @@ from mtsp_env.reading import read_file
 from mtsp_env.tours import check_tours, makespan
 from mtsp_env.writing import atomic_write
 
-Knows = Literal["observation", "map"]
-"""What a method may know: "observation", what one agent sees when it decides, and no more; "map", the whole instance
-from the beginning, for example to plan centrally or to play whole games and choose the best."""
+Knows = Literal["observation", "global", "map"]
+"""What a method may know: "observation", what one agent sees when it decides, and no more; "global", everything that is
+known to anybody at that time; "map", the whole instance from the beginning, for example to plan centrally or to play
+whole games and choose the best."""
 
 Text = Annotated[str, Meta(max_length=80, pattern=r"^[^|\r\n<>`\[\]]*$")]  # shown in a table
 Name = Annotated[str, Meta(min_length=1, max_length=80, pattern=r"^[^|\r\n<>`\[\]]+$")]
@@ -33,12 +33,14 @@ class CellResult(msgspec.Struct, forbid_unknown_fields=True):
     """One size of a test set.
 
     Attributes:
+        seconds: mean wall time of one instance; null: not measured.
         tours: the tours of each instance, in the test set's order.
-        seconds: mean wall time of one instance.
+        decisions: of the test set "worlds" instead of tours: the nodes that the agents picked in each game, in turn.
     """
 
-    tours: list[Tours]
-    seconds: Annotated[float, Meta(ge=0)]
+    seconds: Annotated[float, Meta(ge=0)] | None
+    tours: list[Tours] | None = None
+    decisions: list[list[int]] | None = None
 
 
 class Submission(msgspec.Struct, forbid_unknown_fields=True):
@@ -47,7 +49,7 @@ class Submission(msgspec.Struct, forbid_unknown_fields=True):
     Attributes:
         method: the method's name.
         by: who submits it.
-        test_set: name of a test set (``test_sets.TEST_SETS``).
+        test_set: name of a test set (``test_sets.TEST_SETS``), or "worlds".
         knows: what the method may know; see ``Knows``.
         machine: the machine that the seconds were measured on, and the number of threads.
         cells: label of a size, such as "50x5" for n = 50 and m = 5 -> its results.
@@ -106,13 +108,13 @@ def judge(submission: Submission) -> list[Row]:
     for label, result in submission.cells.items():
         if label not in cells:
             raise ValueError(f"test set {submission.test_set!r} has no cell {label!r}; choose from {sorted(cells)}")
-        if not math.isfinite(result.seconds):
-            raise ValueError(f"{label}: seconds must be finite, got {result.seconds!r}")
         rows += _judge_cell(submission, test_set, cells[label], result)
     return rows
 
 
 def _judge_cell(submission: Submission, test_set: TestSet, cell: AnyCell, result: CellResult) -> list[Row]:
+    if result.tours is None:
+        raise ValueError(f"{cell.label} needs tours")
     if len(result.tours) != cell.count:
         raise ValueError(f"{cell.label} has {cell.count} instances, got the tours of {len(result.tours)}")
     rows = []
@@ -136,7 +138,7 @@ def _judge_cell(submission: Submission, test_set: TestSet, cell: AnyCell, result
                 bound=None,
                 length=None,
                 rounded_length=None,
-                seconds=result.seconds,
+                seconds=0.0 if result.seconds is None else result.seconds,
                 cpu_seconds=None,
                 tours=tours,
                 versions={},

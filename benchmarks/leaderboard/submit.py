@@ -10,8 +10,9 @@ from rich.progress import track
 
 from benchmarks import solvers, suite
 from benchmarks.harness.machine import describe_machine
-from benchmarks.leaderboard import test_sets
+from benchmarks.leaderboard import test_sets, worlds
 from benchmarks.leaderboard.submission import CellResult, Knows, Submission, judge, write
+from benchmarks.leaderboard.test_sets import WORLDS
 from benchmarks.solvers import Answer
 from mtsp_env.checks import check_seconds
 from mtsp_env.instance import Instance, Tours
@@ -41,14 +42,14 @@ def submit(
         out: the JSON file to write, gzipped if its name ends in ".gz".
         method: the method's name on the leaderboard.
         by: who submits it.
-        test_set: public or uniform.
+        test_set: public, uniform, or worlds, which takes a policy alone, and plays its greedy games.
         policy: a shipped network's name or a weights file.
         network: package.module:factory of the network, if it is not a registered one.
         samples: draw that many games with the policy and take the best; by default one greedy game.
         augment: with the policy, play in the square's eight symmetries and take the best.
         solver: a solver's name, or package.module:function that takes (instance, seconds, seed).
         seconds: the solver's budget for each instance.
-        cells: labels of the sizes, such as 50x5; by default all of the test set.
+        cells: labels of the sizes, such as 50x5, or of worlds, such as "everything 50x5"; by default all.
         link: address of a paper or a repository.
 
     Returns:
@@ -64,6 +65,8 @@ def submit(
         raise ValueError("--solver needs --seconds, its budget for each instance")
     if seconds is not None:
         check_seconds("seconds", seconds)
+    if test_set == WORLDS:
+        return _submit_games(out, method, by, policy, network, cells, link)
     chosen_set = test_sets.find(test_set)
     chosen = suite.choose(list(chosen_set.cells.values()), cells)
     plan = _policy(policy, network, samples, augment) if policy is not None else _solver(solver, seconds)
@@ -79,7 +82,7 @@ def submit(
 def _run(plan: Plan, instances: list[Instance], label: str) -> CellResult:
     begin = time.perf_counter()
     tours = [plan(instance, number) for number, instance in enumerate(track(instances, description=label))]
-    return CellResult(tours, (time.perf_counter() - begin) / len(instances))
+    return CellResult(seconds=(time.perf_counter() - begin) / len(instances), tours=tours)
 
 
 def _policy(policy: str, network: str | None, samples: int | None, augment: bool) -> Plan:
@@ -105,3 +108,23 @@ def _solver(name: str, seconds: float) -> Plan:
         return answer.tours if isinstance(answer, Answer) else answer
 
     return plan
+
+
+def _submit_games(
+    out: Path, method: str, by: str, policy: str | None, network: str | None, labels: tuple[str, ...], link: str
+) -> str:
+    from dan_policy import load
+    from dan_policy.games import chooser
+
+    if policy is None:
+        raise ValueError("the test set worlds needs a --policy")
+    known = worlds.cells()
+    for label in labels:
+        if label not in known:
+            raise ValueError(f"unknown cell {label!r}; choose from {list(known)}")
+    games = worlds.play_cells(chooser(load(policy, network=network)), labels or known)
+    machine = str(describe_machine()["processor"])
+    submission = Submission(method, by, WORLDS, "observation", machine, games, link)
+    worlds.judge_submission(submission)
+    write(out, submission)
+    return str(out)

@@ -35,6 +35,7 @@ class TestSet:
         return {cell.label: cell for cell in suite.cells(self.table)}
 
 
+WORLDS = "worlds"  # the one test set of games instead of tours: ``benchmarks.leaderboard.worlds``
 TEST_SETS: dict[str, TestSet] = {
     "public": TestSet(
         table="seed3333",
@@ -57,5 +58,5 @@ TEST_SETS: dict[str, TestSet] = {
 def find(name: str) -> TestSet:
     """The test set of that name. Raises ValueError for an unknown one."""
     if name not in TEST_SETS:
-        raise ValueError(f"unknown test set {name!r}; choose from {sorted(TEST_SETS)}")
+        raise ValueError(f"unknown test set {name!r}; choose from {[*sorted(TEST_SETS), WORLDS]}")
     return TEST_SETS[name]
