@@ -347,14 +347,22 @@ class raw_env(AECEnv):
         return np.concatenate([per_node.ravel(), per_agent.ravel(), *extra]).astype(np.float32)
 
     def render(self) -> np.ndarray | None:
-        """ "rgb_array": the picture, uint8 (height, width, 3). "human": shown in a window, None."""
+        """ "rgb_array": the picture, uint8 (height, width, 3). "human": shown in a window, None.
+
+        Cities are hidden until they appear. A grey disc marks where an agent has broken down, and the legend says who
+        has, and who waits at the depot.
+        """
         if self.render_mode is None:
             raise ValueError(f"render() needs a render_mode; choose from {self.metadata['render_modes']} at creation")
         from mtsp_env.render import Viewer
 
         if self._viewer is None:
             self._viewer = Viewer(show=self.render_mode == "human")
-        return self._viewer.draw(self.instance, self.tours)
+        game, now = self.game, self.now
+        known = None if game.appear_tick is None else game.appear_tick[0] <= now
+        alive = np.ones(self.n_agents, bool) if game.alive is None else game.alive[0]
+        waits = alive & (game.destination[0] == 0) & (game.leg[0] == 0.0) & (game.ready[0] > now)
+        return self._viewer.draw(self.instance, self.tours, known, ~alive, waits & (not self._is_over))
 
     def close(self) -> None:
         """Close the window, if there is one."""

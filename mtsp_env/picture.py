@@ -75,37 +75,56 @@ class Picture:
         ax.set(aspect="equal", xticks=[], yticks=[])  # hidden ticks would still take time
         ax.axis("off")
 
-    def update(self, tours: Sequence[Sequence[int]]) -> None:
-        """Show tours, finished or partial. A ring marks the destination of an agent whose tour is still open."""
+    def update(
+        self,
+        tours: Sequence[Sequence[int]],
+        known: np.ndarray | None = None,
+        broken: np.ndarray | None = None,
+        waits: np.ndarray | None = None,
+    ) -> None:
+        """Show tours, finished or partial. A ring marks the destination of an agent whose tour is still open.
+
+        Args:
+            tours: one per agent.
+            known: (n,) bool; the other cities are hidden. None: all are known.
+            broken: (m,) bool, the agents that have broken down: a grey disc marks where, if it is not the depot.
+            waits: (m,) bool, the agents that wait at the depot.
+        """
         nodes, lengths = self.instance.nodes, path_lengths(self.instance.nodes, tours)
         owner = np.full(len(nodes), -1)  # (n,) the agent that visits each node; -1: none
         for agent, tour in enumerate(tours):
             owner[list(tour)] = agent
         open_tours = [agent for agent, tour in enumerate(tours) if tour[-1] != 0]
         longest = int(lengths.argmax()) if lengths.any() else None
-        self._show([nodes[list(tour)] for tour in tours], lengths, owner, longest)
-        heads = nodes[[tours[agent][-1] for agent in open_tours]]
-        self.heads.set(offsets=heads, facecolor="none", edgecolor=self.colours[open_tours])
+        broken = np.zeros(len(tours), bool) if broken is None else broken
+        notes = _notes(broken, np.zeros(len(tours), bool) if waits is None else waits)
+        self._show([nodes[list(tour)] for tour in tours], lengths, owner, longest, known, notes)
+        rings, grey = self.colours[open_tours], broken[open_tours][:, None]
+        edges, faces = np.where(grey, _rgba("white"), rings), np.where(grey, _rgba(BROKEN), _rgba("none"))
+        self.heads.set(offsets=nodes[[tours[a][-1] for a in open_tours]], facecolor=faces, edgecolor=edges)
 
         visited = int((owner[1:] >= 0).sum())
-        if open_tours or visited < len(nodes) - 1:
+        if not broken[open_tours].all() or visited < len(nodes) - 1:
             label = self._labels(lengths)[int(lengths.argmax())]
-            self._set_title(f"{visited} of {len(nodes) - 1} cities, longest tour so far {label}")
+            cities = f"{len(nodes) - 1} cities" if known is None else f"{int(known[1:].sum())} known cities"
+            self._set_title(f"{visited} of {cities}, longest tour so far {label}")
         else:
             self._set_title(self._summary(lengths))
 
     def update_moment(self, moment: Moment, time: float, end: float) -> None:
         """Show where a team is at ``time`` of a log that ends at ``end``.
 
-        A disc marks where each agent is; it is grey if the agent has broken down. Cities are hidden until they appear.
+        A disc marks where each agent is; it is grey if the agent has broken down. The legend says who has, and who waits
+        at the depot. Cities are hidden until they appear.
         """
         over = time >= end  # until then, all agents of one speed have driven equally far
         longest = int(moment.lengths.argmax()) if over and moment.lengths.any() else None
         appears, breaks = self.instance.appears, self.instance.breaks
         known = np.ones(len(moment.owner), bool) if appears is None else appears <= time
-        self._show(moment.paths, moment.lengths, moment.owner, longest, known)
         positions = np.array([path[-1] for path in moment.paths])
         broken = np.zeros(len(positions), bool) if breaks is None else breaks <= time
+        notes = _notes(broken, moment.waits & (not over))
+        self._show(moment.paths, moment.lengths, moment.owner, longest, known, notes)
         colours = np.where(broken[:, None], _rgba(BROKEN), self.colours)
         self.heads.set(offsets=positions, facecolor=colours, edgecolor="white")
         if over and math.isclose(moment.lengths.max(), end):  # nobody has waited: the time is the makespan
@@ -122,11 +141,13 @@ class Picture:
         lengths: np.ndarray,
         owner: np.ndarray,
         longest: int | None,
-        known: np.ndarray | None = None,
+        known: np.ndarray | None,
+        notes: Sequence[str],
     ) -> None:
         """Move the lines to ``paths``, (k, 2) each; colour the cities by ``owner`` (n,); list ``lengths`` (m,).
 
-        The line and the length of agent ``longest`` are bold. Cities that are not ``known`` (n,) are hidden.
+        The line and the length of agent ``longest`` are bold. Cities that are not ``known`` (n,) are hidden. ``notes``
+        (m,) follow the lengths.
         """
         for agent, (line, path) in enumerate(zip(self.lines, paths, strict=True)):
             line.set_data(*path.T)
@@ -137,24 +158,28 @@ class Picture:
             edgecolor=np.where(visited, _rgba("white"), _rgba(UNVISITED)),
             alpha=None if known is None else known[1:].astype(float),
         )
-        self._update_legend(lengths, self._labels(lengths), longest)
+        self._update_legend(lengths, self._labels(lengths), longest, notes)
 
     def _labels(self, lengths: np.ndarray) -> list[str]:
         return format_lengths([*(lengths * self.instance.scale).tolist(), self.longest])[: len(lengths)]
 
     def _summary(self, lengths: np.ndarray) -> str:
-        makespan = self._labels(lengths)[int(lengths.argmax())]
-        return f"{self.instance.n_nodes - 1} cities, {self.instance.n_agents} agents, makespan {makespan}"
+        longest = self._labels(lengths)[int(lengths.argmax())]
+        what = "longest tour" if self.instance.world else "makespan"  # lengths are no times there
+        return f"{self.instance.n_nodes - 1} cities, {self.instance.n_agents} agents, {what} {longest}"
 
     def _set_title(self, text: str) -> None:
         self.ax.set_title(f"{self.instance.name or 'mTSP'}: {text}", parse_math=False)
 
-    def _update_legend(self, lengths: np.ndarray, labels: list[str], longest: int | None) -> None:
+    def _update_legend(
+        self, lengths: np.ndarray, labels: list[str], longest: int | None, notes: Sequence[str]
+    ) -> None:
         listed = np.sort(np.argsort(-lengths, kind="stable")[:LEGEND_ROWS])
         for agent, handle, text in zip(listed, self.legend.get_lines(), self.legend.get_texts(), strict=True):
             handle.set(color=self.colours[agent], linestyle=self.lines[agent].get_linestyle())
             handle.set_linewidth(self.bold if agent == longest else self.thin)
-            text.set_text(f"agent {agent}:  {labels[agent]}{'  longest' if agent == longest else ''}")
+            note = notes[agent] or ("longest" if agent == longest else "")
+            text.set_text(f"agent {agent}:  {labels[agent]}  {note}".rstrip())
             text.set_fontweight("bold" if agent == longest else "normal")
 
 
@@ -163,6 +188,10 @@ def _colours(n_agents: int) -> np.ndarray:
     from matplotlib.colors import to_rgba_array
 
     return to_rgba_array([COLOURS[agent % len(COLOURS)] for agent in range(n_agents)])
+
+
+def _notes(broken: np.ndarray, waits: np.ndarray) -> list[str]:
+    return ["broken" if fails else "waits" if idle else "" for fails, idle in zip(broken, waits, strict=True)]
 
 
 def _rgba(colour: str) -> tuple[float, ...]:

@@ -114,8 +114,17 @@ class Viewer:
         self._figure: Figure | None = None
         self._instance: Instance | None = None
 
-    def draw(self, instance: Instance, tours: Sequence[Sequence[int]]) -> np.ndarray | None:
+    def draw(
+        self,
+        instance: Instance,
+        tours: Sequence[Sequence[int]],
+        known: np.ndarray | None = None,
+        broken: np.ndarray | None = None,
+        waits: np.ndarray | None = None,
+    ) -> np.ndarray | None:
         """Draw ``tours``; returns the picture, uint8 (600, 800, 3), or None if it is shown in a window.
+
+        ``known`` (n,), ``broken`` (m,) and ``waits`` (m,), bool, say what a world has come to: see ``Picture.update``.
 
         Raises:
             ImportError: matplotlib is not installed.
@@ -129,7 +138,7 @@ class Viewer:
             self._figure.clear()
             self._picture = Picture(self._figure.add_axes((0.02, 0.02, 0.70, 0.90)), instance)
             self._instance = instance
-        self._picture.update(tours)
+        self._picture.update(tours, known, broken, waits)
 
         canvas = self._figure.canvas
         if self.show:

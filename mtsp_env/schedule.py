@@ -23,11 +23,13 @@ class Moment:
         paths: one array (k, 2) per agent, the points of the way that it has driven so far; the last is its position.
         lengths: (m,) how far each agent has driven, in units of the unit square.
         owner: (n,) the agent that has reached each node; -1: none.
+        waits: (m,) bool, the agents that stand at the depot and will set off later.
     """
 
     paths: list[np.ndarray]
     lengths: np.ndarray
     owner: np.ndarray
+    waits: np.ndarray
 
 
 def make_log(
@@ -109,18 +111,20 @@ def moment(instance: Instance, log: Log, time: float) -> Moment:
     """Where the team of a log is at ``time``, at least 0. On its way, an agent moves at an even speed."""
     nodes = instance.nodes
     owner = np.full(len(nodes), -1)
-    paths = []
+    paths, waits = [], np.zeros(len(log), bool)
     for agent, legs in enumerate(log):
-        points = [nodes[0]]
+        points, here = [nodes[0]], 0
         for leg in legs:
             if leg.departed > time:
+                waits[agent] = here == 0
                 break
             if leg.arrived <= time:
                 points.append(nodes[leg.node])
-                owner[leg.node] = agent
+                owner[leg.node], here = agent, leg.node
                 continue
             share = (time - leg.departed) / (leg.arrived - leg.departed)  # 0 if it never arrives
             points.append(points[-1] + share * (nodes[leg.node] - points[-1]))
+            here = -1  # on the way
         paths.append(np.array(points))
     lengths = np.array([np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in paths])
-    return Moment(paths, lengths, owner)
+    return Moment(paths, lengths, owner, waits)

@@ -287,3 +287,41 @@ def test_without_matplotlib_the_message_says_what_to_install(monkeypatch, tmp_pa
     ):
         with pytest.raises(ImportError, match=r'pip install "mtsp-env\[render\]"'):
             draw()
+
+
+# Worlds
+
+
+def known_and_broken(rng: np.random.Generator, batch: int, n_nodes: int, n_agents: int) -> dict[str, np.ndarray]:
+    return {"appears": np.zeros((batch, n_nodes)), "breaks": np.full((batch, n_agents), np.inf)}
+
+
+def test_the_environment_shows_who_waits_who_is_broken_and_which_cities_have_appeared() -> None:
+    """By hand: agent 0 visits city 1 and waits at home; agent 1 visits city 2 and breaks down on its way to city 3."""
+    nodes = [[0.5, 0.5], [0.6, 0.5], [0.3, 0.5], [0.1, 0.5], [0.5, 0.9]]
+    instance = Instance(nodes, 2, appears=[0.0, 0.0, 0.0, 0.2, 1.5], breaks=[np.inf, 0.35])
+    env = mtsp_v0.raw_env(5, 2, scenario=known_and_broken, depot="wait", render_mode="rgb_array")
+    env.reset(options={"instance": instance})
+    grey, hollow, shown, plan = to_rgba("#777777"), to_rgba("none"), {}, [1, 2, 0, 0, 3, 3, 0, 0, 4]
+    while not any(env.terminations.values()):
+        env.render()
+        picture = env._viewer._picture
+        notes = [text.split("  ")[2:] for text in legend(picture.ax)]
+        title = picture.ax.get_title().removeprefix("mTSP: ").partition(",")[0]
+        places, faces = picture.heads.get_offsets().tolist(), picture.heads.get_facecolor().tolist()
+        discs = [(tuple(place), tuple(face)) for place, face in zip(places, faces, strict=True)]
+        shown[env.now] = (title, notes, picture.cities.get_alpha().tolist(), discs)
+        env.step(plan[int(env.game.decisions[0])])
+    env.render()
+    first, second, third = (0.6, 0.5), (0.3, 0.5), (0.1, 0.5)
+    assert shown == {  # as the last agent to decide at each of these ticks sees it
+        0: ("1 of 2 known cities", [["longest"], []], [1, 1, 0, 0], [(first, hollow)]),
+        10: ("2 of 2 known cities", [[], ["longest"]], [1, 1, 0, 0], [(first, hollow), (second, hollow)]),
+        20: ("2 of 3 known cities", [["waits"], ["longest"]], [1, 1, 1, 0], [(second, hollow)]),
+        35: ("2 of 3 known cities", [[], ["broken"]], [1, 1, 1, 0], [(second, grey)]),
+        75: ("3 of 3 known cities", [["longest"], ["broken"]], [1, 1, 1, 0], [(third, hollow), (second, grey)]),
+        115: ("3 of 3 known cities", [["longest"], ["broken"]], [1, 1, 1, 0], [(second, grey)]),
+        150: ("3 of 4 known cities", [["longest"], ["broken"]], [1, 1, 1, 1], [(second, grey)]),
+    }
+    assert picture.ax.get_title() == "mTSP: 4 cities, 2 agents, longest tour 1.800"
+    assert legend(picture.ax) == ["agent 0:  1.800  longest", "agent 1:  0.200  broken"]
