@@ -49,6 +49,9 @@ def make_page(
 ) -> str:
     """A team on its tours as an HTML page: a map, a slider over time, and a table of the tours.
 
+    In a world that changes, cities are hidden until they appear, tours are drawn as far as they have been driven, an
+    agent that has broken down is grey, and the table says who has, and who waits at the depot.
+
     Args:
         instance: the problem.
         tours: one per agent. All agents set off at time 0 and never wait. The instance must be plain.
@@ -67,7 +70,7 @@ def make_page(
 
 def _describe(instance: Instance, log: Log, share: bool, notes: Sequence[str]) -> dict[str, Any]:
     """What the script of the page reads. Times are in units of distance at speed 1; infinity becomes null."""
-    paths = [[0, *(leg.node for leg in legs)] for legs in log]
+    paths = [[0, *(leg.node for leg in legs if math.isfinite(leg.arrived))] for legs in log]
     lengths = path_lengths(instance.nodes, paths) * instance.scale
     end = end_time(log)
     # Tours take as long as they are. The times of a log are those of the clock, which counts in whole ticks.
@@ -83,6 +86,7 @@ def _describe(instance: Instance, log: Log, share: bool, notes: Sequence[str]) -
                 "legs": [[leg.node, *(_finite(time) for time in leg[1:])] for leg in legs],
                 "cities": sum(node != 0 for node in paths[agent]),
                 "length": label,
+                "breaks": None if instance.breaks is None else _finite(float(instance.breaks[agent])),
                 "last": part if share else _home(legs, instance.scale, end),
             }
         )
@@ -90,6 +94,8 @@ def _describe(instance: Instance, log: Log, share: bool, notes: Sequence[str]) -
     return {
         "heading": f"{instance.name or 'mTSP'}: {instance.n_nodes - 1} cities, {len(log)} agents, {ending}",
         "nodes": instance.nodes.tolist(),
+        "appears": None if instance.appears is None else instance.appears.tolist(),
+        "changes": instance.waiting_counts,
         "scale": instance.scale,
         "decimals": len(last.partition(".")[2]),
         "end": end,

@@ -114,8 +114,8 @@ class Picture:
     def update_moment(self, moment: Moment, time: float, end: float) -> None:
         """Show where a team is at ``time`` of a log that ends at ``end``.
 
-        A disc marks where each agent is; it is grey if the agent has broken down. The legend says who has, and who waits
-        at the depot. Cities are hidden until they appear.
+        A disc marks where each agent is; it is grey if the agent has broken down. The legend says who has, and who
+        waits at the depot. Cities are hidden until they appear.
         """
         over = time >= end  # until then, all agents of one speed have driven equally far
         longest = int(moment.lengths.argmax()) if over and moment.lengths.any() else None
@@ -171,9 +171,7 @@ class Picture:
     def _set_title(self, text: str) -> None:
         self.ax.set_title(f"{self.instance.name or 'mTSP'}: {text}", parse_math=False)
 
-    def _update_legend(
-        self, lengths: np.ndarray, labels: list[str], longest: int | None, notes: Sequence[str]
-    ) -> None:
+    def _update_legend(self, lengths: np.ndarray, labels: list[str], longest: int | None, notes: Sequence[str]) -> None:
         listed = np.sort(np.argsort(-lengths, kind="stable")[:LEGEND_ROWS])
         for agent, handle, text in zip(listed, self.legend.get_lines(), self.legend.get_texts(), strict=True):
             handle.set(color=self.colours[agent], linestyle=self.lines[agent].get_linestyle())

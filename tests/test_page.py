@@ -7,7 +7,9 @@ import math
 import re
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from html.parser import HTMLParser
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -92,6 +94,31 @@ def test_files_are_written_whole(tmp_path, square, square_tours) -> None:
     assert list(tmp_path.iterdir()) == [tmp_path / "a.html"]
 
 
+# A world that changes, by hand: agent 0 visits city 1 and waits at home until agent 1, which has visited city 2, breaks
+# down at 0.35 on its way to city 3; agent 0 visits that city, waits again, and visits city 4, which appears at 1.5.
+
+CHANGING = Instance(
+    [[0.5, 0.5], [0.6, 0.5], [0.3, 0.5], [0.1, 0.5], [0.5, 0.9]],
+    2,
+    appears=[0.0, 0.0, 0.0, 0.2, 1.5],
+    breaks=[math.inf, 0.35],
+)
+CHANGING_LOG = [
+    [(1, 0, 0.1, 0.1), (0, 0.1, 0.2, 0.2), (3, 0.35, 0.75, 0.75), (0, 0.75, 1.15, 1.15), (4, 1.5, 1.9, 1.9),
+     (0, 1.9, 2.3, 2.3)],
+    [(2, 0, 0.2, 0.2), (3, 0.2, math.inf, math.inf)],
+]  # fmt: skip
+
+
+def test_a_world_says_what_appears_and_who_breaks_down() -> None:
+    data = data_of(make_page(CHANGING, log=CHANGING_LOG))
+    assert (data["appears"], data["changes"]) == ([0.0, 0.0, 0.0, 0.2, 1.5], True)
+    assert [agent["breaks"] for agent in data["agents"]] == [None, 0.35]
+    assert [(agent["cities"], agent["length"]) for agent in data["agents"]] == [(3, "1.800"), (1, "0.200")]
+    plain = data_of(make_page(Instance(CHANGING.nodes, 1), [[0, 1, 2, 3, 4, 0]]))
+    assert (plain["appears"], plain["changes"], plain["agents"][0]["breaks"]) == (None, False, None)
+
+
 # In a browser
 
 
@@ -109,15 +136,22 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def shown(browser: Any, tmp_path, square: Instance, square_tours: list[list[int]]) -> Iterator[Any]:
-    """The square's page in the browser; the test fails if the page writes to the console or asks for anything."""
+    """The square's page in the browser."""
     save_page(tmp_path / "a.html", square, square_tours)
+    with opened(browser, tmp_path / "a.html") as page:
+        yield page
+
+
+@contextmanager
+def opened(browser: Any, path: Path) -> Iterator[Any]:
+    """A page in the browser; the test fails if the page writes to the console or asks for anything."""
     page, complaints = browser.new_page(), []
     page.on("console", lambda message: complaints.append(message.text))
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.on("request", lambda request: complaints.append(request.url))
-    page.goto((tmp_path / "a.html").as_uri())
+    page.goto(path.as_uri())
     yield page
-    assert complaints == [(tmp_path / "a.html").as_uri()]
+    assert complaints == [path.as_uri()]
     page.close()
 
 
@@ -186,3 +220,35 @@ def test_play_runs_to_the_end(shown: Any) -> None:
     assert 0.9 < float(state(shown)["clock"].removeprefix("time ")) < 1.1
     shown.clock.run_for(7000)
     assert (state(shown)["clock"], state(shown)["button"]) == ("time 2.000", "Play")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("time", "states", "known", "coloured", "discs", "is_grey"),
+    [
+        (0.0, ["", ""], 2, 0, [[782, 782], [782, 782]], False),
+        (0.25, ["waits", ""], 3, 2, [[782, 782], [406, 782]], False),  # agent 1 never arrives
+        (0.4, ["", "broken"], 3, 2, [[688, 782], [406, 782]], True),
+        (1.2, ["waits", "broken"], 3, 3, [[782, 782], [406, 782]], True),
+        (2.3, ["", "broken"], 4, 4, [[782, 782], [406, 782]], True),
+    ],
+)
+def test_worlds_change_with_the_slider(browser, tmp_path, time, states, known, coloured, discs, is_grey) -> None:
+    save_page(tmp_path / "a.html", CHANGING, log=CHANGING_LOG)
+    with opened(browser, tmp_path / "a.html") as page:
+        page.evaluate("time => show(time)", time)
+        now = state(page)
+        assert [[round(x) for x in disc] for disc in now["discs"]] == discs
+        assert now["coloured"] == coloured
+        assert page.evaluate("cities.filter((city) => city !== null && city.style.display === '').length") == known
+        assert page.evaluate("data.agents.map((_, index) => tours[index].cell.textContent)") == states
+        assert page.evaluate("tours.map(({ disc }) => disc.style.fill !== '')") == [False, is_grey]
+        drawn = page.evaluate("tours.map(({ planned, driven }) => planned.points.length - driven.points.length)")
+        assert drawn == [0, 0]  # where they will go is not drawn
+        assert page.is_visible("#state")
+
+
+@pytest.mark.slow
+def test_plain_pages_have_no_column_for_what_changes(shown: Any) -> None:
+    assert not shown.is_visible("#state")
+    assert shown.evaluate("tours.map(({ planned, driven }) => planned.points.length)") == [5, 5]
