@@ -12,7 +12,7 @@ from gymnasium import spaces
 from pettingzoo import AECEnv
 from pettingzoo.utils import wrappers
 
-from mtsp_env import rules
+from mtsp_env import rules, world
 from mtsp_env.distributions import Generator, check_distribution, distribution_name, sample, scenario_shapes
 from mtsp_env.instance import Instance, Problem, Tours, batch
 from mtsp_env.log import write_log
@@ -331,18 +331,19 @@ class raw_env(AECEnv):
     def state(self) -> np.ndarray:
         """What is known to all agents together, and their own times: float32 (3 n + 4 m,), more in worlds.
 
-        Nodes (x, y, visited), agents (destination x, y; g; own time after the current leg), then those of
-        ``agent_speeds``, ``agent_alive``, ``service`` and ``city_known`` that the world has.
+        Nodes (x, y, visited), agents (destination x, y; g; own time after the current leg, as announced if there is
+        traffic on it), then those of ``agent_speeds``, ``agent_alive``, ``service`` and ``city_known`` that the world
+        has. Nothing in it depends on what happens later.
         """
         game, m = self.game, self.n_agents
         seen = rules.observe(game, self._all_knowing)
+        decider = rules.agent_to_decide(game)
+        own_time = world.known_own_times(game, self.rules, decider, rules.now(game))
         nodes = self.instance.nodes
         if seen.city_known is not None:
             nodes = np.where(seen.city_known[0][:, None], nodes, nodes[0])
         per_node = np.concatenate([nodes, seen.visited[0][:, None]], axis=1)
-        per_agent = np.concatenate(
-            [nodes[game.destination[0]], seen.agents[0][:, 2:], game.own_time[0].reshape(m, 1)], axis=1
-        )
+        per_agent = np.concatenate([nodes[game.destination[0]], seen.agents[0][:, 2:], own_time.reshape(m, 1)], axis=1)
         extra = [array[0] for name, array in seen.arrays().items() if name in rules.OBSERVED]
         return np.concatenate([per_node.ravel(), per_agent.ravel(), *extra]).astype(np.float32)
 

@@ -196,17 +196,7 @@ def _free_times(game: rules.State, game_rules: rules.Rules) -> np.ndarray:
     is_there[agent] = True
     if game.problem.waiting_counts:  # an agent that waits at the depot leaves it at the clock's time
         return tick * game_rules.speed + np.where(is_there, 0.0, np.maximum(leg - elapsed, 0.0))
-    own_time = game.own_time[0]
-    if game.legs is None:
-        return own_time
-    # own_time counts the traffic on the leg under way, which nobody knows yet: take it out, and round what is left, so
-    # that not even the last bit depends on it
-    arrays = game.problem.arrays
-    factors = arrays["traffic"][0]
-    visit = arrays["service"][0, game.destination[0]] if "service" in arrays else 0.0
-    factor = factors[np.arange(len(leg)), (game.legs[0] - 1) % factors.shape[1]]
-    before = np.round(own_time - (leg - visit) * factor - visit, 9)
-    return np.where(is_there, own_time, before + np.maximum(leg, elapsed))
+    return world.known_own_times(game, game_rules, np.array([agent]), rules.now(game))[0]
 
 
 def _take_over(game: rules.State, routes: Tours, agent: int) -> None:

@@ -219,6 +219,28 @@ def add_to_view(
     return seen
 
 
+def known_own_times(state: State, rules: Rules, decider: Array, tick: Array) -> Array:
+    """(B, m) Own times after the current legs, as far as anybody can know them while ``decider`` (B,) decides.
+
+    The traffic on a leg under way is not known yet: it is expected to take as long as announced, or as long as it has
+    taken so far if that is longer. Without traffic these are ``state.own_time``, to the last bit.
+    """
+    if state.legs is None:
+        return state.own_time
+    arrays, (xp, _) = state.problem.arrays, library(state.own_time)
+    k = arrays["traffic"].shape[2]
+    which = indices(state.ready, axis=1) * k + (state.legs - 1) % k  # (B, m)
+    factor = pick_many(xp.reshape(arrays["traffic"], (-1, state.ready.shape[1] * k)), which)
+    visit = pick_many(arrays["service"], state.destination) if "service" in arrays else 0.0
+    took = (state.leg - visit) * factor + visit
+    before = xp.round((state.own_time - took) * 1e9) / 1e9  # so that not even its last bit depends on the factor
+    elapsed = tick[:, None] - state.departed
+    is_over = (state.leg == 0.0) | (elapsed >= ticks_of(took, rules))
+    is_over = is_over | (indices(state.ready, axis=1) == decider[:, None])
+    elapsed = cast(elapsed, "float64") * rules.speed
+    return xp.where(is_over, state.own_time, before + xp.maximum(state.leg, elapsed))
+
+
 # What a game costs
 
 

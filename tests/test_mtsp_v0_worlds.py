@@ -8,6 +8,7 @@ import warnings
 
 import numpy as np
 import pytest
+from helpers.future import long_everything, long_traffic, other_future
 from helpers.games import over, play, random_action
 from pettingzoo.test import api_test, seed_test
 from pettingzoo.test.state_test import test_state as check_state
@@ -95,6 +96,55 @@ def test_rewards_sum_to_the_judged_makespan(scenario: str) -> None:
         paid = sum(rewards["agent_0"] for *_, rewards in play(env))
         assert paid == pytest.approx(-check_log(env.instance, env.log, 0.1), abs=1e-9)
         assert paid == pytest.approx(-env.infos["agent_2"]["makespan"], abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "depot"),
+    [(long_everything, "open"), (long_everything, "wait"), (long_traffic, "wait"), (long_traffic, "final")],
+)
+def test_nothing_that_anybody_sees_depends_on_the_future(scenario, depot: str) -> None:
+    """Bit for bit, for every agent at every decision until the moment from which the future differs, and state()."""
+    differ = 0
+    for seed in range(15):
+        rng = np.random.default_rng(seed)
+        env = mtsp_v0.raw_env(9, 3, speed=0.05, depot=depot, scenario=scenario)
+        env.reset(seed=seed)
+        play(env, seed)
+        instance, log, actions = env.instance, env.log, list(env._decisions)
+        change = int(rng.integers(1, env.now)) * env.rules.speed
+        other = other_future(instance, log, change, rng)
+        env.reset(options={"instance": instance})
+        twin = mtsp_v0.raw_env(9, 3, speed=0.05, depot=depot, scenario=scenario)
+        twin.reset(options={"instance": other})
+        for action in actions:
+            if over(twin) or max(env.now, twin.now) * env.rules.speed > change:
+                break
+            assert np.array_equal(env.state(), twin.state())
+            for agent in env.possible_agents:
+                seen, again = env.observe(agent), twin.observe(agent)
+                assert np.array_equal(seen["action_mask"], again["action_mask"])
+                for key, value in seen["observation"].items():
+                    assert np.array_equal(value, again["observation"][key]), key
+            env.step(action)
+            twin.step(action)
+        differ += not np.array_equal(env.game.own_time, twin.game.own_time)
+    assert differ > 5
+
+
+def test_own_times_are_those_announced_until_a_delay_shows() -> None:
+    """By hand: agent 1 drives 0.4 in traffic that triples it, while agent 0 decides at ticks 1, 2, 5 and 9."""
+    nodes = [[0.5, 0.5], [0.6, 0.5], [0.5, 0.9], [0.5, 0.2], [0.9, 0.2], [0.5, 0.1], [0.1, 0.1]]
+    env = mtsp_v0.raw_env(7, 2, speed=0.1, scenario=lambda rng, batch, n, m: {"traffic": np.ones((batch, m, 1))})
+    env.reset(options={"instance": Instance(nodes, 2, traffic=[[1.0], [3.0]])})
+    known = []
+    for node in (1, 2, 0, 3, 4, 5, 0):
+        known.append((env.now, env.agent_selection, *env.state()[3 * 7 :].reshape(2, 4)[:, 3].round(6).tolist()))
+        env.step(node)
+    assert [(tick, agent) for tick, agent, *_ in known] == [
+        (0, "agent_0"), (0, "agent_1"), (1, "agent_0"), (2, "agent_0"), (5, "agent_0"), (9, "agent_0"), (12, "agent_1")
+    ]  # fmt: skip
+    assert [own for *_, own, _ in known] == pytest.approx([0.0, 0.1, 0.1, 0.2, 0.5, 0.9, 0.9 + 0.17**0.5])
+    assert [own for *_, own in known] == pytest.approx([0.0, 0.0, 0.4, 0.4, 0.5, 0.9, 1.2])
 
 
 def test_an_instance_of_another_world_is_refused() -> None:
