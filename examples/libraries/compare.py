@@ -1,4 +1,4 @@
-"""What the examples of this folder share: the game, and four policies on the same held-out instances.
+"""What the examples of this folder share: the game, and policies to compare with on the same held-out instances.
 
 A policy is a function of what the deciding agent sees: ``choose(observation, mask)`` returns the node to go to next.
 ``observation`` is the dict of ``gymnasium.make("mtsp/MinMaxMTSP-v0")``, and ``mask`` (n,) bool are the legal nodes.
@@ -40,7 +40,7 @@ def arguments(description: str | None, steps: int) -> argparse.Namespace:
 
 
 def compare(library: str, choose: Policy, steps: int, seconds: float) -> None:
-    """Print the mean makespan, and its standard error, of four policies on the held-out instances.
+    """Print the mean makespan, and its standard error, of five policies on the held-out instances.
 
     Args:
         library: its name.
@@ -50,9 +50,9 @@ def compare(library: str, choose: Policy, steps: int, seconds: float) -> None:
     """
     rng = np.random.default_rng(TEST_SEED)
     instances = [mtsp_env.uniform(rng, GAME["n_nodes"], GAME["n_agents"]) for _ in range(TEST_INSTANCES)]
-    chance = np.random.default_rng(0)
     makespans = {
-        "random": play(lambda observation, mask: chance.choice(np.flatnonzero(mask)), instances),
+        "random": play(Random(home_last=False), instances),
+        "home-last": play(Random(home_last=True), instances),
         library: play(choose, instances),
         "nearest": play(nearest, instances),
         "reference": [mtsp_env.makespan(instance, improve(instance)) for instance in instances],
@@ -75,6 +75,17 @@ def play(choose: Policy, instances: list[mtsp_env.Instance]) -> list[float]:
             over = terminated or truncated
         makespans.append(info["makespan"])
     return makespans
+
+
+class Random:
+    """Any legal node; with ``home_last`` only cities while there are any, which most learners find out first."""
+
+    def __init__(self, home_last: bool):
+        self.home_last, self.rng = home_last, np.random.default_rng(0)
+
+    def __call__(self, observation: dict[str, np.ndarray], mask: np.ndarray) -> int:
+        nodes = np.flatnonzero(mask)
+        return self.rng.choice(nodes[nodes > 0] if self.home_last and mask[1:].any() else nodes)
 
 
 def nearest(observation: dict[str, np.ndarray], mask: np.ndarray) -> int:
