@@ -25,11 +25,12 @@ from tiny import TINY
 from benchmarks.files import write_text
 from benchmarks.harness import rows
 from benchmarks.harness.journal import Journal
+from benchmarks.leaderboard import submission
 from benchmarks.reports import plots
 from dan_policy import DAN, load, save
 from mtsp_env import write_instance, write_tours
 from mtsp_env.distributions import sample
-from mtsp_env.render import save_picture
+from mtsp_env.render import animate, save_page, save_picture
 from train import checkpoint
 from train.__main__ import main
 from train.logs import Logs
@@ -140,10 +141,17 @@ def full_disk():
 
 INSTANCE = sample("uniform", np.random.default_rng(0), 1, 500, 2).instance(0, "large")
 TOURS = [[0, *range(1, 250), 0], [0, *range(250, 500), 0]]
+FEW = sample("uniform", np.random.default_rng(0), 1, 3, 2).instance(0, "small")
+SUBMISSION = submission.Submission(
+    "mine", "me", "uniform", "map", "a machine", {"500x2": submission.CellResult([TOURS], 1.0)}
+)
 WRITERS = {
     "a.json": lambda path: write_instance(path, INSTANCE),
     "tours.json": lambda path: write_tours(path, TOURS),
     "tours.png": lambda path: save_picture(path, INSTANCE, TOURS),
+    "tours.html": lambda path: save_page(path, INSTANCE, TOURS),
+    "tours.gif": lambda path: animate(path, FEW, [[0, 1, 0], [0, 2, 0]], seconds=0.2),
+    "submission.json": lambda path: submission.write(path, SUBMISSION),
     "net.safetensors": lambda path: save(path, DAN(TINY.network)),
     "checkpoint.pt": lambda path: checkpoint.write(path, {"a": torch.arange(1000)}),
     "report.md": lambda path: write_text(path, "x" * 5000),
