@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import subprocess
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -134,9 +135,14 @@ def _write_mp4(path: Path, draw: Draw, times: list[float], frames_per_second: in
 
     still = [times[-1]] * round(LAST_FRAME_SECONDS * frames_per_second)
     height, width, _ = draw(0.0).shape
-    options = {"codec": "libx264", "output_params": ["-f", "mp4"], "ffmpeg_log_level": "error"}
-    writer = imageio_ffmpeg.write_frames(str(path), (width, height), fps=frames_per_second, **options)
-    with contextlib.closing(writer):
-        writer.send(None)  # starts ffmpeg
-        for time in [*times, *still]:
-            writer.send(draw(time))
+    frames = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(frames_per_second), "-i", "-"]
+    film = ["-c:v", "libx264", "-crf", "25", "-pix_fmt", "yuv420p", "-f", "mp4", "-y", str(path)]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", *frames, *film]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
+        assert ffmpeg.stdin is not None  # it is a pipe
+        with contextlib.suppress(BrokenPipeError):  # it has ended, and says why
+            for time in [*times, *still]:
+                ffmpeg.stdin.write(draw(time).tobytes())
+        errors = ffmpeg.communicate()[1].decode(errors="replace").split("\n")
+    if ffmpeg.returncode != 0:
+        raise OSError(f"ffmpeg failed with exit code {ffmpeg.returncode} {errors[0]}".rstrip())
