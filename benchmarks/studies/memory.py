@@ -128,6 +128,8 @@ def main(share: float = 1.0, cases: tuple[str, ...] = tuple(CASES)) -> None:
         check_count(f"rounds of {name!r}", rounds, 10)
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), end_with_parent) as pool:
             memory = pool.submit(measure, name, rounds).result()
+        growth = (memory.end - memory.warm) / 2**20
+        print(f"{rounds} {name}: {growth:+.1f} MiB in {memory.seconds:.0f} s", file=sys.stderr)
         sizes = (memory.warm, memory.end, memory.end - memory.warm, memory.peak)
         table.add_row(str(rounds), name, *(f"{size / 2**20:,.1f}" for size in sizes), f"{memory.seconds:.0f}")
     Console().print(table)
