@@ -194,6 +194,13 @@ def seed_of(table: str, seed: int | None = None) -> int:
     return PUBLIC_SEED
 
 
+def check_instances(count: int, minimum: int = 1) -> None:
+    """Raise ValueError unless a cell may have that many instances."""
+    check_count("instances", count, minimum)
+    if count > MOST_INSTANCES:
+        raise ValueError(f"instances must be at most {MOST_INSTANCES}, got {count}")
+
+
 def cells(table: str, tsplib: Path | None = None, count: int | None = None) -> tuple[AnyCell, ...]:
     """The cells of a table.
 
@@ -209,9 +216,7 @@ def cells(table: str, tsplib: Path | None = None, count: int | None = None) -> t
         raise ValueError(f"unknown table {table!r}; choose from {sorted(TABLES)}")
     chosen = TABLES[table]
     if count is not None:
-        check_count("instances", count, minimum=1)
-        if count > MOST_INSTANCES:
-            raise ValueError(f"instances must be at most {MOST_INSTANCES}, got {count}")
+        check_instances(count)
         if any(isinstance(cell, TsplibCell) for cell in chosen) and count != 1:
             raise ValueError(f"table {table} has 1 instance in each cell, got instances = {count}")
         chosen = tuple(replace(cell, count=count) for cell in chosen)

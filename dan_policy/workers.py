@@ -12,9 +12,11 @@ from typing import Literal
 
 from mtsp_env import reference
 from mtsp_env.instance import Instance, Tours, from_coordinates
+from mtsp_env.machine import check_memory
 from mtsp_env.processes import end_with_parent
 
 Method = Literal["reference", "dan"]
+BYTES_PER_PROCESS = 2**27  # that has imported Numba, at least
 NICENESS = 5  # of the planning processes: the one that answers goes first
 _policy: str | None = None  # in a planning process: the name or file of its policy
 
@@ -29,9 +31,11 @@ class Workers:
     Raises:
         ImportError: the policy's packages are missing.
         OSError: no such weights.
+        ValueError: so many processes do not fit into the memory.
     """
 
     def __init__(self, count: int, policy: str | None):
+        check_memory("processes", count, BYTES_PER_PROCESS)
         self.count, self.policy = count, policy
         if policy is not None:
             _load(policy)  # here, so that what is wrong with it is an error of this process

@@ -269,6 +269,12 @@ def test_bad_configurations_are_named(kwargs, message):
         ImitateConfig(**kwargs)
 
 
+@pytest.mark.parametrize("option", ["workers", "buffer"])
+def test_what_does_not_fit_into_the_memory_is_refused(option):
+    with pytest.raises(ValueError, match=f"{option} 1000000000 needs about .* GiB of memory, .* fits"):
+        ImitationLearner(replace(TINY_PLANS, **{option: 10**9}))
+
+
 @pytest.mark.slow
 def test_the_command_line_imitates(tmp_path, capsys):
     small = ["--n-nodes", "6", "7", "--n-agents", "1", "2", "--nodes-per-agent", "2", "--set-tokens", "100",

@@ -12,6 +12,7 @@ from dan_policy.episode import rollout
 from dan_policy.joint import JointConfig, JointDAN
 from dan_policy.symmetry import views
 from mtsp_env import check_tours, makespan
+from mtsp_env.distributions import sample
 from mtsp_env.instance import Instance
 from train import checkpoint
 from train.__main__ import main
@@ -43,6 +44,12 @@ TINY = ImproveConfig(
 def network():
     torch.manual_seed(0)
     return JointDAN(TINY.joint)
+
+
+def test_games_that_do_not_fit_into_the_memory_are_refused():
+    problem = sample("uniform", np.random.default_rng(0), 2, 20, 2)
+    with pytest.raises(ValueError, match=r"samples 1000000000 needs about .* GiB of memory, .* fits"):
+        repeat(problem, 10**9)
 
 
 def test_the_best_games_are_those_that_the_judge_finds_best(network):

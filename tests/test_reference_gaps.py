@@ -192,6 +192,7 @@ def test_a_damaged_list_of_long_runs_is_named(monkeypatch, places) -> None:
     ("arguments", "message"),
     [
         ({"instances": 1}, "instances must be a whole number of at least 2, got 1"),
+        ({"instances": 10**9}, "instances must be at most 10000, got 1000000000"),
         ({"workers": 0}, "workers must be a whole number of at least 1, got 0"),
         ({"seed": -1}, "seed must be a whole number of at least 0, got -1"),
         ({"sample": 1}, "sample must be 0 or at least 2, got 1"),

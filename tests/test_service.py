@@ -297,6 +297,7 @@ def test_bad_limits(change: dict, message: str) -> None:
 
 def test_bad_options_of_the_command(capsys: pytest.CaptureFixture) -> None:
     assert "--port: must be at most 65535, got 65536" in refused(capsys, "serve", "--port", "65536")
+    assert "processes 1000000000 needs about" in refused(capsys, "serve", "--processes", "1000000000")
     assert "--max-nodes: must be a whole number of at least 2" in refused(capsys, "serve", "--max-nodes", "1")
 
 

@@ -36,6 +36,8 @@ def test_the_table_compares_with_the_c_in_use(tmp_path, capsys) -> None:
     ]  # fmt: skip
     assert [row[3] == "–" for row in rows] == [True, False, False] * 2
     assert main(["sweep-clip", "--instances", "1"]) == 2 and "at least 2, got 1" in capsys.readouterr().err
+    assert main(["sweep-view", "--instances", "1000000000"]) == 2
+    assert "instances must be at most 10000, got 1000000000" in capsys.readouterr().err
     assert main(["sweep-clip", "--sizes", "50"]) == 2 and "such as 50x5, got '50'" in capsys.readouterr().err
 
 

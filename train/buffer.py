@@ -19,11 +19,14 @@ from torch import Tensor
 
 from dan_policy.actor import Key
 from dan_policy.registry import find
+from mtsp_env.machine import check_memory
 from mtsp_env.processes import end_with_parent
-from train.demonstrations import Demonstrations, as_decisions, demonstrate
+from train.demonstrations import LEAST_GAMES, Demonstrations, as_decisions, demonstrate
 from train.interrupts import ENDING
 from train.plans import PLAN_KEYS, add_plans
 from train.supervised_config import ImitateConfig
+
+BYTES_PER_WORKER = 2**28  # of a process that has imported torch, at least
 
 
 class Buffer:
@@ -36,9 +39,15 @@ class Buffer:
         keys: the parts of the observation that the network needs.
         rng: draws sets and decision indices.
         plans: label each decision with the teacher's plan for all agents (``train.plans``).
+
+    Raises:
+        ValueError: the sets or the workers do not fit into the memory.
     """
 
     def __init__(self, config: ImitateConfig, keys: Sequence[Key], rng: np.random.Generator, plans: bool = False):
+        check_memory("workers", config.workers, BYTES_PER_WORKER)
+        # The coordinates alone, in float32, of the smallest set, in which each game takes n - 1 decisions or more
+        check_memory("buffer", config.buffer, 8 * LEAST_GAMES * (config.n_nodes[0] - 1) * config.n_nodes[0])
         self.config, self.keys, self.rng, self.plans = config, keys, rng, plans
         self.student = None if config.roll_in is None else hashlib.sha256(find(config.roll_in).read_bytes()).hexdigest()
         self.indices: list[int] = []  # index of each set at hand

@@ -75,6 +75,7 @@ def repeat(problem: Problem, samples: int) -> Problem:
     """Each instance ``samples`` times in succession, going through the eight symmetries of the square."""
     if samples == 1:
         return problem
+    check_memory("samples", samples, BYTES_PER_NODE * len(problem.nodes) * problem.n_nodes)
     repeated = {name: array.repeat_interleave(samples, 0) for name, array in problem.arrays.items()}
     return Problem(problem.n_agents, repeated | {"nodes": views(problem.nodes, samples).flatten(0, 1)})
 

@@ -29,6 +29,8 @@ from train.collect import autocast, draw_size, environment, rotated
 from train.network import load_student
 from train.supervised_config import ImitateConfig, SupervisedConfig
 
+LEAST_GAMES, MOST_GAMES = 16, 256  # of a set
+
 
 class Demonstrations(NamedTuple):
     """A set of instances of one size, with the teacher's plan for each: every agent's whole tour."""
@@ -45,7 +47,7 @@ def demonstrate(config: ImitateConfig, index: int) -> Demonstrations:
 
     rng = np.random.default_rng([config.seed, index])
     n_nodes, n_agents = draw_size(rng, config)
-    batch = int(np.clip(config.set_tokens // n_nodes, 16, 256))
+    batch = int(np.clip(config.set_tokens // n_nodes, LEAST_GAMES, MOST_GAMES))
     batch = 1 << batch.bit_length() - 1  # few different shapes, so that oneDNN builds few kernels
     problem = sample(config.generator(), rng, batch, n_nodes, n_agents)
     check_plain(problem)  # the teacher solves plain problems only

@@ -12,7 +12,7 @@ from scipy.stats import sem
 
 from benchmarks import solvers
 from benchmarks.reports.markdown import markdown_table
-from benchmarks.suite import SEED, Cell
+from benchmarks.suite import SEED, Cell, check_instances
 from mtsp_env.checks import check_count, check_seconds
 from mtsp_env.instance import Instance, Tours
 from mtsp_env.tours import check_tours, lower_bound, makespan
@@ -68,7 +68,7 @@ def main(instances: int = 5, seconds: tuple[float, ...] = (0.1, 1.0, 5.0), seed:
     Raises:
         ValueError: an argument outside its range.
     """
-    check_count("instances", instances, minimum=2)
+    check_instances(instances, minimum=2)
     check_count("seed", seed, minimum=0)
     for budget in seconds:
         check_seconds("seconds", budget)

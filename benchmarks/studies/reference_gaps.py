@@ -19,7 +19,7 @@ from benchmarks import best_known
 from benchmarks.files import write_text
 from benchmarks.harness.machine import describe_machine
 from benchmarks.reports.markdown import markdown_table
-from benchmarks.suite import SEED, Cell
+from benchmarks.suite import SEED, Cell, check_instances
 from mtsp_env.checks import check_count, check_seconds
 from mtsp_env.files import read_json
 from mtsp_env.instance import Tours
@@ -126,7 +126,7 @@ def main(
     Raises:
         ValueError: an argument outside its range.
     """
-    check_count("instances", instances, minimum=2)
+    check_instances(instances, minimum=2)
     check_count("workers", workers, minimum=1)
     check_count("seed", seed, minimum=0)
     by_label = {target.label: target for target in TARGETS}

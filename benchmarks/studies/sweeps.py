@@ -12,10 +12,9 @@ from scipy.stats import sem
 from benchmarks.files import write_text
 from benchmarks.harness.machine import describe_machine
 from benchmarks.reports.markdown import markdown_table
-from benchmarks.suite import Cell
+from benchmarks.suite import Cell, check_instances
 from dan_policy import Solution, solve
 from dan_policy.heuristics import sampling_clip
-from mtsp_env.checks import check_count
 from mtsp_env.instance import Instance
 
 RESULTS = Path(__file__).parents[1] / "results"
@@ -96,7 +95,7 @@ def sweep_view(
 
 
 def _cells(sizes: Iterable[str], instances: int) -> list[Cell]:
-    check_count("instances", instances, minimum=2)
+    check_instances(instances, minimum=2)
     return [_cell(size, instances) for size in sizes]
 
 
