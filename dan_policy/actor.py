@@ -3,7 +3,8 @@
 A *network* is a module or a plain function that takes the tensors of its ``in_keys`` in order and returns logits
 (..., n). Attributes that it may have:
 
-- ``in_keys``: the keys of the observation that it reads, by default ``OBSERVATION``; a nested key is a tuple;
+- ``in_keys``: the keys of the observation that it reads, by default ``OBSERVATION``; a nested key is a tuple. It gets
+  None for a key that the observation does not have, such as ``agent_speeds`` in a plain game;
 - ``config``: a dataclass. ``dan_policy.solve`` can change its fields ``tanh_clip``, ``view`` and ``prune_visited``, if
   it has them, for one call, so the network should read them in each forward pass;
 - ``supports_bfloat16``: True if its matrix products may run in bfloat16 under ``torch.autocast``.

@@ -137,10 +137,14 @@ def _logits_of_choice(decided: TensorDictBase) -> Tensor:
     return torch.full(mask.shape, -torch.inf, device=mask.device).scatter(1, action[:, None], 0.0)
 
 
-def _tensor(state: rules.State, seen: rules.Observation, key: Key) -> Tensor:
-    """What a network reads under ``key``: a part of the observation, or of the state under "game"."""
+def _tensor(state: rules.State, seen: rules.Observation, key: Key) -> Tensor | None:
+    """What a network reads under ``key``: a part of the observation, or of the state under "game".
+
+    None: a part that only observations in worlds have.
+    """
     if isinstance(key, str) and key in seen._fields:
-        return torch.as_tensor(getattr(seen, key))
+        array = getattr(seen, key)
+        return None if array is None else torch.as_tensor(array)
     arrays = state.arrays()
     if isinstance(key, tuple) and len(key) == 2 and key[0] == "game" and key[1] in arrays:
         return torch.as_tensor(arrays[key[1]])

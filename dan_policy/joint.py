@@ -4,11 +4,16 @@ In DAN, the agents' embeddings do not depend on the cities, and cities do not at
 attended to the agents. Here all tokens attend to each other in every layer, at the same cost.
 The policy stays decentralised: one agent's observation in, logits of that agent's next node out.
 
+In worlds it can read further keys (``JointConfig.reads``). Each adds a learned vector to some tokens, times how far the
+value is from its neutral one. The vectors begin as zero, so that weights without them go on as they are; a key that an
+observation does not have counts as neutral.
+
 This module knows no environment: it takes tensors and returns tensors.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -24,6 +29,18 @@ from dan_policy.layers import (
     scatter_nodes,
 )
 
+AGENT_KEYS = {"agent_speeds": 1.0, "agent_alive": 1.0, "agent_known": 1.0}
+"""What can be read of each agent (..., m), with its neutral value; it goes to the agent's token."""
+
+NODE_KEYS = {"service": 0.0}
+"""What can be read of each node (..., n), with its neutral value; it goes to the node's token."""
+
+SHARE_KEYS = {"city_known": 1.0}
+"""What can be read of all nodes (..., n), with its neutral value; its mean goes to the depot's token. Unknown nodes
+have no token of their own."""
+
+READABLE = {**AGENT_KEYS, **NODE_KEYS, **SHARE_KEYS}
+
 
 @dataclass(frozen=True)
 class JointConfig:
@@ -31,7 +48,8 @@ class JointConfig:
 
     Raises:
         ValueError: a size below 1 or beyond ``layers.GREATEST``, a number of heads that does not divide the width, a
-            clip that is not above 0 or beyond ``layers.GREATEST_CLIP``, or a view below 1.
+            clip that is not above 0 or beyond ``layers.GREATEST_CLIP``, a view below 1, or keys to read that are
+            unknown or named twice.
     """
 
     embed_dim: int = 128  # d
@@ -40,6 +58,7 @@ class JointConfig:
     n_layers: int = 5
     tanh_clip: float = 10.0  # C: logits lie in [-C, C]
     view: int | None = None  # see at most this many cities, the nearest unvisited ones; None: all of them
+    reads: tuple[str, ...] = ()  # keys of observations in worlds that it reads as well, of READABLE
 
     def __post_init__(self) -> None:
         check_sizes(self, "embed_dim", "feedforward_dim", "n_heads", "n_layers")
@@ -48,18 +67,22 @@ class JointConfig:
         check_clip(self.tanh_clip)
         if self.view is not None and not (type(self.view) is int and self.view >= 1):
             raise ValueError(f"view must be None or at least 1 city, got {self.view!r}")
+        object.__setattr__(self, "reads", tuple(self.reads))  # JSON has lists only
+        if not set(self.reads) <= set(READABLE) or len(set(self.reads)) < len(self.reads):
+            raise ValueError(f"reads must be different keys of {list(READABLE)}, got {list(self.reads)}")
 
 
 class JointDAN(nn.Module):
     """One pre-norm transformer over all tokens, then a single-head pointer from each agent to the nodes."""
 
-    in_keys = ("cities", "agents", "visited", "agent")
+    in_keys: tuple[str, ...] = ("cities", "agents", "visited", "agent")
     supports_bfloat16 = True  # trained and tested under autocast: logits stay float32
     dense_outputs = ("next", "assignment")
 
     def __init__(self, config: JointConfig | None = None):
         super().__init__()
         self.config = config = config or JointConfig()
+        self.in_keys = (*JointDAN.in_keys, *config.reads)
         d = config.embed_dim
         self.embed_depot = nn.Linear(2, d)
         self.embed_city = nn.Linear(2, d)
@@ -73,8 +96,9 @@ class JointDAN(nn.Module):
         self.next_key = nn.Linear(d, d, bias=False)
         self.assignment_query = nn.Linear(d, d, bias=False)
         self.assignment_key = nn.Linear(d, d, bias=False)
+        self.effect = nn.ParameterDict({key: torch.zeros(d) for key in config.reads})  # of each key, see the module
 
-    def forward(self, cities: Tensor, agents: Tensor, visited: Tensor, agent: Tensor) -> Tensor:
+    def forward(self, cities: Tensor, agents: Tensor, visited: Tensor, agent: Tensor, *extra: Tensor | None) -> Tensor:
         """Logits over the nodes for one observation per row. Any number of leading dimensions is fine.
 
         Args:
@@ -82,18 +106,22 @@ class JointDAN(nn.Module):
             agents: (..., m, 3) float, destinations relative to the deciding agent, and remaining travel times.
             visited: (..., n) bool, the global mask M, False at the depot.
             agent: (...) int64, the deciding agent's index; other agents may stand at the same place.
+            *extra: (..., m) or (..., n), what ``config.reads`` names, in that order; None, or left out at the end: the
+                observation does not have it.
 
         Returns:
             (..., n) float, in [-C, C]; -C at visited nodes and out of view.
         """
         lead, n = visited.shape[:-1], visited.shape[-1]
         cities, agents, visited, agent = _rows(cities, agents, visited, agent)
-        h_agents, h_nodes, in_view = self._encode(cities, agents, visited, agent)
+        h_agents, h_nodes, in_view = self._encode(cities, agents, visited, agent, extra)
         h_decider = _gather(h_agents, agent[:, None])  # (B, 1, d)
         logits = self._next(h_decider, h_nodes)  # (B, 1, k)
         return scatter_nodes(logits, in_view, visited, -self.config.tanh_clip).reshape(*lead, n)
 
-    def forward_dense(self, cities: Tensor, agents: Tensor, visited: Tensor, agent: Tensor) -> DenseLogits:
+    def forward_dense(
+        self, cities: Tensor, agents: Tensor, visited: Tensor, agent: Tensor, *extra: Tensor | None
+    ) -> DenseLogits:
         """Logits of the policy, of all agents' next nodes and of each city's visitor; arguments as in ``forward``.
 
         The policy is the deciding agent's row of ``next``. At visited nodes and out of view, ``next`` is -C and
@@ -101,7 +129,7 @@ class JointDAN(nn.Module):
         """
         lead, m, n = visited.shape[:-1], agents.shape[-2], visited.shape[-1]
         cities, agents, visited, agent = _rows(cities, agents, visited, agent)
-        h_agents, h_nodes, in_view = self._encode(cities, agents, visited, agent)
+        h_agents, h_nodes, in_view = self._encode(cities, agents, visited, agent, extra)
         next_logits = self._next(h_agents, h_nodes)  # (B, m, k)
         assignment = pointer_logits(self.assignment_query(h_agents), self.assignment_key(h_nodes))  # (B, m, k)
         next_logits = scatter_nodes(next_logits, in_view, visited, -self.config.tanh_clip)  # (B, m, n)
@@ -109,7 +137,9 @@ class JointDAN(nn.Module):
         policy = _gather(next_logits, agent[:, None])  # (B, 1, n)
         return DenseLogits(policy.reshape(*lead, n), next_logits.reshape(*lead, m, n), assignment.reshape(*lead, m, n))
 
-    def _encode(self, cities: Tensor, agents: Tensor, visited: Tensor, agent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _encode(
+        self, cities: Tensor, agents: Tensor, visited: Tensor, agent: Tensor, extra: Sequence[Tensor | None] = ()
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Embeddings of the agents (B, m, d) and of the nodes in view (B, k, d), and those nodes' indices (B, k)."""
         m = agents.shape[1]
         in_view, real = open_nodes(cities, visited, self.config.view, other_tokens=m)  # (B, k), the depot first
@@ -117,11 +147,26 @@ class JointDAN(nn.Module):
         decides = torch.arange(m, device=agent.device) == agent[:, None]  # (B, m)
         h_agents = self.embed_agent(agents) + decides[:, :, None] * self.decider
         h = torch.cat([h_agents, self.embed_depot(seen[:, :1]), self.embed_city(seen[:, 1:])], dim=1)  # (B, m + k, d)
+        for key, values in zip(self.config.reads, extra, strict=False):
+            if values is not None:
+                h = h + self._effect(key, values.reshape(len(h), -1), in_view, m)
         mask = None if real is None else torch.cat([torch.ones_like(decides), real], dim=1)  # (B, m + k)
         for layer in self.layers:
             h = layer(h, h, mask)
         h = self.norm(h)
         return h[:, :m], h[:, m:], in_view
+
+    def _effect(self, key: str, values: Tensor, in_view: Tensor, m: int) -> Tensor:
+        """What ``values`` (B, m) or (B, n) of ``key`` add to the tokens of m agents and k nodes: (B, m + k, d)."""
+        amount = values.to(self.effect[key].dtype) - READABLE[key]
+        added = amount.new_zeros(len(amount), m + in_view.shape[1])
+        if key in AGENT_KEYS:
+            added[:, :m] = amount
+        elif key in NODE_KEYS:
+            added[:, m:] = amount.gather(1, in_view)
+        else:
+            added[:, m] = amount.mean(1)  # the depot's token
+        return added[:, :, None] * self.effect[key]
 
     def _next(self, h_agents: Tensor, h_nodes: Tensor) -> Tensor:
         """(B, m, d), (B, k, d) -> (B, m, k) logits in [-C, C]."""

@@ -119,6 +119,10 @@ class Replanner:
 
         ``plan`` is what the last decision in this game returned; None: there is none yet.
         """
+        return self.follow(game, game_rules, self.update(game, game_rules, plan))
+
+    def update(self, game: rules.State, game_rules: rules.Rules, plan: Plan | None) -> Plan:
+        """The plan for the decision at hand: ``plan`` itself if nothing has happened that it did not foresee."""
         agent = int(rules.agent_to_decide(game)[0])
         cities = _open_cities(game)
         alive = np.ones(len(game.ready[0]), bool) if game.alive is None else game.alive[0]
@@ -126,6 +130,11 @@ class Replanner:
             plan = None  # of another game
         if plan is None or not _is_up_to_date(plan, cities, alive) or _is_late(game, game_rules, agent):
             plan = Plan(game.problem.nodes[0].copy(), alive.copy(), self._search(game, game_rules, cities, alive, plan))
+        return plan
+
+    def follow(self, game: rules.State, game_rules: rules.Rules, plan: Plan) -> tuple[int, Plan]:
+        """The deciding agent's next node by an up-to-date ``plan``, and the plan from then on."""
+        agent = int(rules.agent_to_decide(game)[0])
         routes = [list(route) for route in plan.routes]
         if not routes[agent] and not rules.legal_actions(game, game_rules, np.array([agent]))[0, 0]:
             _take_over(game, routes, agent)

@@ -23,6 +23,7 @@ from mtsp_env.machine import check_memory
 from mtsp_env.processes import end_with_parent
 from train.demonstrations import LEAST_GAMES, Demonstrations, as_decisions, demonstrate
 from train.interrupts import ENDING
+from train.lessons import Lessons
 from train.plans import PLAN_KEYS, add_plans
 from train.supervised_config import ImitateConfig
 
@@ -76,24 +77,30 @@ class Buffer:
         demonstrations = self._demonstrations(index)
         decisions, valid = self._decisions(demonstrations)
         count = max(1, round(self.config.passes * len(valid)))
-        if self.config.roll_in is None:
+        if isinstance(demonstrations, Lessons) and self.config.roll_in is not None:
+            steps = self.rng.permutation(len(valid))  # all of them follow the student's part
+        elif self.config.roll_in is None:
             steps = self.rng.permutation(len(valid))[:count]
         else:  # right after the student's part, where its mistakes still show
+            assert isinstance(demonstrations, Demonstrations)
             steps = self.rng.permutation(np.arange(demonstrations.begin, len(valid))[:count])
         self.indices.append(index)
         self.left.append(steps.tolist())
         self.sets.append((decisions, valid))
         self.next, self.instances = index + 1, self.instances + valid.shape[1]
 
-    def _decisions(self, demonstrations: Demonstrations) -> tuple[TensorDictBase, Tensor]:
+    def _decisions(self, demonstrations: Demonstrations | Lessons) -> tuple[TensorDictBase, Tensor]:
         """The set's decisions [T, B] with everything that is learnt from, and valid (T, B)."""
+        if isinstance(demonstrations, Lessons):
+            decisions, valid = demonstrations.decisions(self.config.device)
+            return decisions if self.plans else decisions.exclude("plan"), valid
         if not self.plans:
             return as_decisions(demonstrations, self.keys, self.config)
         keys = tuple(dict.fromkeys((*self.keys, *PLAN_KEYS)))
         decisions, valid = as_decisions(demonstrations, keys, self.config)
         return add_plans(decisions, demonstrations), valid
 
-    def _demonstrations(self, index: int) -> Demonstrations:
+    def _demonstrations(self, index: int) -> Demonstrations | Lessons:
         """The set of that index. Workers are kept busy with the next sets, twice as many as there are workers."""
         if self.config.workers == 0:
             return demonstrate(self.config, index)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import lru_cache
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from dan_policy.actor import as_actor
+from dan_policy.actor import Key, as_actor
 from dan_policy.episode import Decode, Episode, rollout
 from dan_policy.symmetry import views
 from mtsp_env.batched import BatchedMTSP
@@ -28,12 +29,18 @@ def draw_size(rng: np.random.Generator, config: RunConfig) -> tuple[int, int]:
     return n_nodes, int(rng.integers(config.n_agents[0], greatest, endpoint=True))
 
 
+def draw_scenario(rng: np.random.Generator, config: RunConfig) -> str:
+    """One of the run's scenarios, all of them equally often."""
+    return config.scenario[rng.integers(len(config.scenario))] if len(config.scenario) > 1 else config.scenario[0]
+
+
 def draw(
     rng: np.random.Generator,
     config: RunConfig,
     batch: int,
     tokens: int | None = None,
     size: tuple[int, int] | None = None,
+    scenario: str | None = None,
 ) -> Problem:
     """A problem of fresh instances, torch tensors on the run's device.
 
@@ -41,17 +48,20 @@ def draw(
         batch: number of instances.
         tokens: upper bound on instances times nodes, which may reduce their number to no less than 1; None: no bound.
         size: n and m; None draws them.
+        scenario: one of ``config.scenario``; None draws it.
 
     Raises:
-        ValueError: the instances do not fit into the memory, or the distribution cannot be drawn from.
+        ValueError: the instances do not fit into the memory, or the distribution or scenario cannot be drawn from.
     """
     n_nodes, n_agents = size or draw_size(rng, config)
+    world = config.world(scenario or draw_scenario(rng, config))
     batch = batch if tokens is None else max(1, min(batch, tokens // n_nodes))
     check_memory(f"the number of instances with {n_nodes} nodes", batch, BYTES_PER_NODE * n_nodes)
     try:
-        arrays = sample(config.generator(), rng, batch, n_nodes, n_agents).arrays
+        arrays = sample(config.generator(), rng, batch, n_nodes, n_agents, world).arrays
     except TypeError as error:  # a function of the user's that takes or returns something else
-        raise ValueError(f"distribution={config.distribution!r} cannot be drawn from ({error})") from error
+        drawn = f"distribution={config.distribution!r} or scenario={config.scenario!r}"
+        raise ValueError(f"{drawn} cannot be drawn from ({error})") from error
     return Problem(n_agents, {name: torch.as_tensor(array, device=config.device) for name, array in arrays.items()})
 
 
@@ -81,11 +91,15 @@ def repeat(problem: Problem, samples: int) -> Problem:
 
 
 def draw_set(rng: np.random.Generator, config: RunConfig, count: int, sizes: int = 8) -> list[Problem]:
-    """``count`` instances to compare policies on, in at most ``sizes`` batches, each with its own n and m."""
+    """``count`` instances to compare policies on, in at most ``sizes`` batches, each with its own n and m.
+
+    There are more batches if there are more scenarios, which take turns.
+    """
     check_memory("the number of instances to compare policies on", count, BYTES_PER_NODE * config.n_nodes[0])
-    sizes = min(sizes, count)
+    turns = config.scenario
+    sizes = min(max(sizes, len(turns)), count)
     counts = [count // sizes + (number < count % sizes) for number in range(sizes)]
-    return [draw(rng, config, part) for part in counts]
+    return [draw(rng, config, part, scenario=turns[i % len(turns)]) for i, part in enumerate(counts)]
 
 
 def play(policy: nn.Module, problem: Problem, config: RunConfig, decode: Decode, keep: bool = False) -> Episode:
@@ -97,7 +111,7 @@ def play(policy: nn.Module, problem: Problem, config: RunConfig, decode: Decode,
     """
     actor = as_actor(policy)
     env = environment(problem, config)
-    keys = tuple(dict.fromkeys(actor.in_keys)) if keep else ()
+    keys = present(env, actor.in_keys) if keep else ()
     with autocast(config):
         return rollout(actor, env, decode, problem, keys)
 
@@ -107,16 +121,41 @@ def costs(policy: nn.Module, problems: list[Problem], config: RunConfig) -> Tens
     return torch.cat([-play(policy, part, config, "greedy").reward for part in problems])
 
 
+def present(env: BatchedMTSP, keys: Iterable[Key]) -> tuple[Key, ...]:
+    """Those of ``keys`` that the environment's observations have, each once: some come in worlds only."""
+    has = set(env.observation_spec.keys(include_nested=True))
+    return tuple(dict.fromkeys(key for key in keys if key in has))
+
+
 def environment(problem: Problem, config: RunConfig) -> BatchedMTSP:
-    """The run's environment for a batch of that size. Environments are reused: building their specs is slow."""
+    """The run's environment for a batch of that size and with such world fields.
+
+    Environments are reused: building their specs is slow.
+    """
+    world = tuple((name, tuple(problem.arrays[name].shape[1:])) for name in problem.world)
+    depot = config.world_depot if world else config.depot
     return _environment(
-        problem.n_nodes, problem.n_agents, len(problem.nodes), config.speed, config.depot, config.device
+        problem.n_nodes, problem.n_agents, len(problem.nodes), world, config.speed, depot, config.device
     )
 
 
 @lru_cache(maxsize=1024)
-def _environment(n_nodes: int, n_agents: int, batch: int, speed: float, depot: Depot, device: str) -> BatchedMTSP:
-    return BatchedMTSP(n_nodes, n_agents, batch, speed, depot, device=device, check_actions=False)
+def _environment(
+    n_nodes: int,
+    n_agents: int,
+    batch: int,
+    world: tuple[tuple[str, tuple[int, ...]], ...],
+    speed: float,
+    depot: Depot,
+    device: str,
+) -> BatchedMTSP:
+    def uneventful(rng: np.random.Generator, batch: int, n_nodes: int, n_agents: int) -> dict[str, np.ndarray]:
+        """A world with the same fields in which everything goes as in the plain problem."""
+        usual = {"speeds": 1.0, "service": 0.0, "appears": 0.0, "breaks": np.inf, "traffic": 1.0}
+        return {name: np.full((batch, *shape), usual[name]) for name, shape in world}
+
+    options = {"device": device, "check_actions": False}
+    return BatchedMTSP(n_nodes, n_agents, batch, speed, depot, scenario=uneventful, **options)
 
 
 def autocast(config: RunConfig) -> torch.autocast:

@@ -12,7 +12,7 @@ from dan_policy.dan import DANConfig
 from dan_policy.joint import JointConfig
 from dan_policy.registry import NETWORKS
 from mtsp_env.checks import check_count, check_seconds
-from mtsp_env.distributions import Generator, check_distribution
+from mtsp_env.distributions import Generator, check_distribution, check_scenario
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +49,11 @@ class RunConfig:
     """Distance per tick, the paper's Delta g."""
     depot: Literal["open", "final"] = "open"
     """Whether an agent that has returned to the depot may leave it again (open) or has finished (final)."""
+    scenario: tuple[str, ...] = ("plain",)
+    """The worlds to train in: names of scenarios, or package.module:function. Each batch draws one of them."""
+    world_depot: Literal["open", "wait"] = "wait"
+    """The depot rule in scenarios other than plain: an agent that stays at the depot is asked again at the next tick
+    (open), or when something happens (wait)."""
 
     policy: str = "dan"
     """The network to train: a registered name, or package.module:factory. The working directory is importable."""
@@ -62,6 +67,9 @@ class RunConfig:
     """Weights to start from: a file, or the name of a shipped model. A registered network takes its options from it."""
     prune_visited: bool | None = None
     """With `init`: override whether the network drops visited cities before its encoders. Its weights stay the same."""
+    reads: tuple[str, ...] | None = None
+    """With `init`: override which extra keys of observations in worlds the network reads. New ones have no effect
+    before they are learnt."""
     max_grad_norm: float = 1.0
     """Gradients are scaled down to this norm if theirs is larger."""
     average: float = 0.0
@@ -106,16 +114,20 @@ class RunConfig:
                 f"got {self.nodes_per_agent}"
             )
         check_distribution(self.generator())
+        if not self.scenario:
+            raise ValueError("scenario must name at least 1 world, such as 'plain'")
+        for name in self.scenario:
+            check_scenario(self.world(name))
 
     def _check_policy(self) -> None:
         if not self.registered and ":" not in self.policy:
             raise ValueError(f"policy must be package.module:factory or one of {sorted(NETWORKS)}, got {self.policy!r}")
         if self.registered and self.policy_options:
             raise ValueError(f"policy_options must be empty for the policy {self.policy!r}, got {self.policy_options}")
-        if self.prune_visited is not None and (self.init is None or not self.registered):
-            raise ValueError(
-                f"prune_visited must be None unless a registered policy starts from init, got {self.prune_visited}"
-            )
+        for name in ("prune_visited", "reads"):
+            value = getattr(self, name)
+            if value is not None and (self.init is None or not self.registered):
+                raise ValueError(f"{name} must be None unless a registered policy starts from init, got {value}")
 
     def _check_at_least(self, minimum: int, *names: str) -> None:
         for name in names:
@@ -149,13 +161,21 @@ class RunConfig:
         Raises:
             ValueError: there is no such function.
         """
-        if ":" not in self.distribution:
-            return self.distribution
-        try:
-            return pkgutil.resolve_name(self.distribution)
-        except (ImportError, AttributeError, ValueError) as error:
-            raise ValueError(f"distribution={self.distribution!r} cannot be imported ({error})") from error
+        return _generator("distribution", self.distribution)
+
+    def world(self, scenario: str) -> str | Generator:
+        """The name of a scenario, or the function that ``package.module:function`` names. Raises as ``generator``."""
+        return _generator("scenario", scenario)
 
     def to_dict(self) -> dict[str, Any]:
         """The configuration as JSON values."""
         return json.loads(json.dumps(asdict(self), default=str))
+
+
+def _generator(option: str, name: str) -> str | Generator:
+    if ":" not in name:
+        return name
+    try:
+        return pkgutil.resolve_name(name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"{option}={name!r} cannot be imported ({error})") from error

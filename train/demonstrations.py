@@ -2,14 +2,13 @@
 
 The teacher's own games only show what to do in states that the teacher reaches. With ``roll_in`` a student plays the
 beginning of every game, including its mistakes, and the teacher continues from there (DAgger: Ross, Gordon & Bagnell
-2011).
+2011). In worlds the teacher has to plan again and again: see ``train.lessons``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -17,16 +16,16 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.modules import ProbabilisticActor
 
-from dan_policy.actor import Key, make_actor
+from dan_policy.actor import Key
 from dan_policy.episode import rollout
 from mtsp_env import rules
 from mtsp_env.distributions import sample
-from mtsp_env.instance import Problem, Tours, check_plain
-from mtsp_env.tours import is_closed
-from train.collect import autocast, draw_size, environment, rotated
-from train.network import load_student
+from mtsp_env.instance import Problem, Tours
+from train.canonical import as_links, canonical
+from train.collect import autocast, draw_scenario, draw_size, environment, rotated
+from train.lessons import Lessons, teach
+from train.network import student
 from train.supervised_config import ImitateConfig, SupervisedConfig
 
 LEAST_GAMES, MOST_GAMES = 16, 256  # of a set
@@ -41,19 +40,21 @@ class Demonstrations(NamedTuple):
     begin: int = 0  # number of decisions of each game that the student took before the teacher's first
 
 
-def demonstrate(config: ImitateConfig, index: int) -> Demonstrations:
+def demonstrate(config: ImitateConfig, index: int) -> Demonstrations | Lessons:
     """The ``index``-th set of a run. It depends on ``config`` and ``index`` alone, not on the process that makes it."""
     from mtsp_env.reference import improve_batch  # imports Numba, which only the teacher needs
 
     rng = np.random.default_rng([config.seed, index])
+    scenario = config.world(draw_scenario(rng, config))
     n_nodes, n_agents = draw_size(rng, config)
     batch = int(np.clip(config.set_tokens // n_nodes, LEAST_GAMES, MOST_GAMES))
     batch = 1 << batch.bit_length() - 1  # few different shapes, so that oneDNN builds few kernels
-    problem = sample(config.generator(), rng, batch, n_nodes, n_agents)
-    check_plain(problem)  # the teacher solves plain problems only
+    problem = sample(config.generator(), rng, batch, n_nodes, n_agents, scenario)
     if config.rotate:
         turned = rotated(rng, problem)
         problem = Problem(n_agents, {name: np.asarray(array) for name, array in turned.arrays.items()})
+    if not problem.is_plain:
+        return teach(config, rng, problem)
     nodes = problem.nodes
     seed = int(rng.integers(2**31))
     begin = 0 if config.roll_in is None else int(rng.integers(n_nodes - 1))  # every game takes n - 1 decisions or more
@@ -70,60 +71,9 @@ def roll_in(config: ImitateConfig, problem: Problem, begin: int) -> list[Tours]:
     config = replace(config, device="cpu")  # the teacher runs there
     env = environment(problem, config)
     with autocast(config):
-        last = rollout(_student(config), env, "greedy", problem, max_decisions=begin).last
+        last = rollout(student(config), env, "greedy", problem, max_decisions=begin).last
     states = zip(last["game", "visits"].numpy(), last["game", "destination"].numpy(), strict=True)
     return [rules.tours(*state, close=False) for state in states]
-
-
-@lru_cache(maxsize=1)
-def _student(config: ImitateConfig) -> ProbabilisticActor:
-    return make_actor(load_student(config))
-
-
-def canonical(nodes: np.ndarray, tours: Tours, prefixes: Tours | None = None) -> Tours:
-    """The same tours, in the one order and direction that a network can learn.
-
-    Agents are alike and tours have no direction, so that any solution is one of m! 2^m equivalent ones, and a network
-    that is shown them at random learns their average. Here tours run counter-clockwise, and agents take them in the
-    order of the angle at which their centroids are seen from the depot. No agent stays at home (depot rule "final"): an
-    idle agent takes over a city, which makes no tour longer. All this applies to agents that are still at the depot;
-    agents that have left it continue as planned.
-
-    Args:
-        nodes: (n, 2) coordinates.
-        tours: tours of m < n agents.
-        prefixes: what each agent has already driven; None: nothing.
-    """
-    prefixes = [[0]] * len(tours) if prefixes is None else prefixes
-    rests = [[node for node in tour[len(prefix) :] if node != 0] for tour, prefix in zip(tours, prefixes, strict=True)]
-    waiting = [agent for agent, prefix in enumerate(prefixes) if len(prefix) == 1]
-    for agent in waiting:
-        spare = [len(rest) - (other in waiting) for other, rest in enumerate(rests)]
-        if not rests[agent] and max(spare) > 0:
-            rests[agent].append(rests[np.argmax(spare)].pop())
-
-    def angle(tour: list[int]) -> float:
-        east, north = nodes[tour].mean(0) - nodes[0] if tour else (-1.0, 0.0)  # empty tours come last
-        return float(np.arctan2(north, east))
-
-    ordered = [rests[agent] if _signed_area(nodes, rests[agent]) >= 0 else rests[agent][::-1] for agent in waiting]
-    for agent, rest in zip(waiting, sorted(ordered, key=angle), strict=True):
-        rests[agent] = rest
-    return [prefix if is_closed(prefix) else [*prefix, *rest, 0] for prefix, rest in zip(prefixes, rests, strict=True)]
-
-
-def _signed_area(nodes: np.ndarray, tour: list[int]) -> float:
-    """Twice the area that a closed tour encloses, positive if it runs counter-clockwise (the shoelace formula)."""
-    x, y = (nodes[tour] - nodes[0]).T  # the depot is the origin and adds nothing
-    return float((x[:-1] * y[1:] - x[1:] * y[:-1]).sum())
-
-
-def as_links(tours: Tours, n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """The first city of each of the m tours (m,), and the node that follows each node (n,)."""
-    following = np.zeros(n_nodes, np.int64)
-    for tour in tours:
-        following[tour[1:-1]] = tour[2:]
-    return np.array([tour[1] for tour in tours]), following
 
 
 def follow(demonstrations: Demonstrations, device: torch.device | str = "cpu") -> TensorDictModule:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 from dataclasses import asdict, is_dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import nn
+from torchrl.modules import ProbabilisticActor
 
 from dan_policy.actor import Key, make_actor
 from dan_policy.registry import NETWORKS, build, load, save
@@ -35,7 +37,7 @@ def make_network(config: RunConfig) -> nn.Module:
             f"init={config.init!r} holds a {type(network).__name__}, but policy is {config.policy!r}: "
             f"give another policy of {sorted(NETWORKS)}"
         )
-    return network if config.prune_visited is None else _pruned(network, config)
+    return _changed(network, config)
 
 
 def _check_plays(network: nn.Module, config: RunConfig) -> None:
@@ -59,11 +61,12 @@ def load_weights(path: str | os.PathLike, config: RunConfig) -> nn.Module:
     return load(path, network=None if config.registered else build(config.policy, config.network_options()))
 
 
-def load_student(config: ImitateConfig) -> nn.Module:
-    """The network of ``config.roll_in``, in evaluation mode."""
+@lru_cache(maxsize=1)
+def student(config: ImitateConfig) -> ProbabilisticActor:
+    """The actor of the network of ``config.roll_in``, in evaluation mode; loaded once."""
     if config.roll_in is None:
         raise ValueError("roll_in must name the student's weights, got None")
-    return load_weights(config.roll_in, config).eval()
+    return make_actor(load_weights(config.roll_in, config).eval())
 
 
 def save_weights(path: Path, network: nn.Module, config: RunConfig, extra: dict[str, Any]) -> None:
@@ -80,11 +83,15 @@ def observation_keys(network: nn.Module) -> tuple[Key, ...]:
     return tuple(dict.fromkeys(make_actor(network).in_keys))
 
 
-def _pruned(network: nn.Module, config: RunConfig) -> nn.Module:
-    """The same weights in a network with another ``prune_visited``."""
+def _changed(network: nn.Module, config: RunConfig) -> nn.Module:
+    """The same weights in a network with the ``prune_visited`` and ``reads`` of the run, if it gives them."""
+    given = {"prune_visited": config.prune_visited, "reads": config.reads}
+    changes = {name: value for name, value in given.items() if value is not None}
+    if not changes:
+        return network
     options: dict[str, Any] = asdict(network.config) if is_dataclass(network.config) else {}
-    if "prune_visited" not in options:
-        raise ValueError(f"prune_visited must be None: the policy {config.policy!r} has no such option")
-    changed = build(config.policy, options | {"prune_visited": config.prune_visited})
-    changed.load_state_dict(network.state_dict())
+    for name in changes.keys() - options.keys():
+        raise ValueError(f"{name} must be None: the policy {config.policy!r} has no such option")
+    changed = build(config.policy, options | changes)
+    changed.load_state_dict(changed.state_dict() | network.state_dict())
     return changed.eval()

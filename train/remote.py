@@ -17,7 +17,7 @@ from dan_policy.actor import Key, make_actor
 from dan_policy.episode import Episode, rollout
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.instance import Problem
-from train.collect import draw, draw_size, environment, play, repeat
+from train.collect import draw, draw_size, environment, play, present, repeat
 from train.network import observation_keys
 from train.reinforce_config import ReinforceConfig
 
@@ -110,7 +110,8 @@ def replay(problem: Problem, action: Tensor, keys: Sequence[Key], config: Reinfo
     """
     steps = iter(action.unbind(1))
     scripted = TensorDictModule(lambda _: next(steps), ["agent"], ["action"])
-    return rollout(scripted, environment(problem, config), "greedy", problem, keys)
+    env = environment(problem, config)
+    return rollout(scripted, env, "greedy", problem, present(env, keys))
 
 
 class _EpisodeCollector(Collector):

@@ -91,7 +91,7 @@ def imitation_losses(network: nn.Module, decisions: TensorDictBase, config: Supe
     """
     if "plan" in decisions.keys():  # noqa: SIM118 (a TensorDict is no mapping)
         forward_dense: Any = network.forward_dense
-        logits: DenseLogits = forward_dense(*(decisions[key] for key in network_keys(network)))
+        logits: DenseLogits = forward_dense(*(decisions.get(key, None) for key in network_keys(network)))
         if config.plan_matching == "invariant":
             decisions = match_plans(logits, decisions, config.next_weight, config.assignment_weight)
         log_prob = logits.policy.masked_fill(~decisions["action_mask"], -torch.inf).log_softmax(1)

@@ -121,6 +121,10 @@ class ImitateConfig(SupervisedConfig):
         if self.sets_per_step > self.buffer:
             raise ValueError(f"sets_per_step must be at most buffer={self.buffer}, got {self.sets_per_step}")
         self._check_share("passes")
+        if self.plan_matching == "invariant" and self.scenario != ("plain",):
+            raise ValueError(
+                f"plan_matching must be 'canonical' in worlds, where agents may differ, got scenario={self.scenario}"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,5 +167,7 @@ class ImproveConfig(SupervisedConfig):
         super().__post_init__()
         self._check_at_least(1, "batch_size", "chunk")
         self._check_at_least(2, "samples")
+        if self.scenario != ("plain",):
+            raise ValueError(f"scenario must be 'plain', for imitation and reinforce know worlds, got {self.scenario}")
         if self.batch_tokens is not None:
             self._check_at_least(1, "batch_tokens")
