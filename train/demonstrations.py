@@ -23,7 +23,7 @@ from mtsp_env import rules
 from mtsp_env.distributions import sample
 from mtsp_env.instance import Problem, Tours
 from train.canonical import as_links, canonical
-from train.collect import autocast, draw_scenario, draw_size, environment, rotated
+from train.collect import autocast, draw_scenario, draw_size, environment, present, rotated
 from train.lessons import Lessons, teach
 from train.network import student
 from train.supervised_config import ImitateConfig, SupervisedConfig
@@ -96,7 +96,7 @@ def as_decisions(
     """Turn the teacher's tours into decisions, in the order of the environment's clock.
 
     Args:
-        keys: the parts of the observation to keep.
+        keys: the parts of the observation to keep; those that only worlds have are left out.
 
     Returns:
         decisions: TensorDict [T, B] with ``keys`` and the teacher's ``action``.
@@ -105,5 +105,5 @@ def as_decisions(
     nodes = torch.as_tensor(demonstrations.nodes, device=config.device)
     problem = Problem(demonstrations.first.shape[1], {"nodes": nodes})
     env = environment(problem, config)
-    episode = rollout(follow(demonstrations, config.device), env, "greedy", problem, keys)
+    episode = rollout(follow(demonstrations, config.device), env, "greedy", problem, present(env, keys))
     return episode.decisions, episode.valid

@@ -7,8 +7,9 @@ of every game, and any state that it reaches is where a plan can begin.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -22,6 +23,9 @@ from train.canonical import counter_clockwise, in_order
 from train.collect import autocast, environment
 from train.network import student
 from train.supervised_config import ImitateConfig
+
+if TYPE_CHECKING:
+    from mtsp_env.replan import Plan, Replanner
 
 
 class Lessons(NamedTuple):
@@ -61,7 +65,7 @@ def teach(config: ImitateConfig, rng: np.random.Generator, problem: Problem) -> 
         limit = max(1, round(config.passes * problem.n_nodes))
     iterations = config.teacher_iterations * problem.n_nodes
     planner = Replanner(iterations=iterations, seed=int(rng.integers(2**31)))
-    plans = [None] * len(problem.nodes)
+    plans: list[Plan | None] = [None] * len(problem.nodes)
     decisions, valid, over = [], [], state["done"][:, 0]
     while len(valid) != limit and not over.all():
         labels, plans = _labels(planner, env, state, plans, ~over)
@@ -95,8 +99,10 @@ def _as_tensordict(problem: Problem) -> TensorDict:
     return TensorDict({"game": TensorDict(game, size)}, size)
 
 
-def _labels(planner, env: BatchedMTSP, state: TensorDictBase, plans: list, playing: torch.Tensor):
-    """What the teacher intends in each game that is not over: labels (B, ...), and the plans after its decisions."""
+def _labels(
+    planner: Replanner, env: BatchedMTSP, state: TensorDictBase, plans: Sequence[Plan | None], playing: torch.Tensor
+) -> tuple[dict[str, np.ndarray], list[Plan | None]]:
+    """What the teacher intends in each game that is ``playing`` (B,): labels (B, ...), and the plans from then on."""
     arrays = {name: tensor.numpy() for name, tensor in state["game"].items()}
     batch, n_nodes, n_agents = *arrays["visited"].shape, env.n_agents
     labels = {
