@@ -25,6 +25,7 @@ from train.supervised_config import ImitateConfig, ImproveConfig
 
 pytest.importorskip("numba", reason="the teacher is compiled with Numba")
 
+KEYS = ("cities", "agents", "visited", "agent", "action_mask")
 WORLDS = tuple(name for name in SCENARIOS if name != "plain")
 TINY = replace(
     TINY_PLANS,
@@ -66,6 +67,21 @@ def test_labels_of_a_game_solved_by_hand():
     assert plan["next"].tolist() == [[1, 3], [2, 3], [2, 0], [2, 0]]
     assert not plan["closed"].any()
     assert plan["visitor"][:, 2].tolist() == [0, 0, 0, 0] and plan["visitor"][:2, 3].tolist() == [1, 1]
+
+
+def test_those_who_go_on_waiting_are_not_learnt_from():
+    """Agent 1 is far too slow to help: it stays at the depot whenever it is asked."""
+    nodes = [[0.5, 0.5], [0.9, 0.4], [0.9, 0.6], [0.4, 0.5]]
+    config = replace(TINY, teacher_iterations=200, roll_in=None)
+    lessons = teach(config, np.random.default_rng(0), problem_of(nodes, speeds=[1.5, 0.01]))
+    assert lessons.valid.all() and lessons.arrays["agent"].tolist() == [[0]] * 3
+    assert sorted(lessons.arrays["action"][:, 0]) == [1, 2, 3]
+    buffer = Buffer(replace(TINY, workers=0), KEYS, np.random.default_rng(0))
+    empty = Lessons({key: array[:0] for key, array in lessons.arrays.items()}, lessons.valid[:0])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("train.buffer.demonstrate", lambda config, index: empty)
+        buffer.add(0)
+    assert buffer.sets == [] and buffer.next == 1  # nothing to draw from it
 
 
 def test_others_visit_what_a_broken_agent_leaves():

@@ -84,9 +84,10 @@ class Buffer:
         else:  # right after the student's part, where its mistakes still show
             assert isinstance(demonstrations, Demonstrations)
             steps = self.rng.permutation(np.arange(demonstrations.begin, len(valid))[:count])
-        self.indices.append(index)
-        self.left.append(steps.tolist())
-        self.sets.append((decisions, valid))
+        if len(steps):
+            self.indices.append(index)
+            self.left.append(steps.tolist())
+            self.sets.append((decisions, valid))
         self.next, self.instances = index + 1, self.instances + valid.shape[1]
 
     def _decisions(self, demonstrations: Demonstrations | Lessons) -> tuple[TensorDictBase, Tensor]:

@@ -37,7 +37,7 @@ class Lessons(NamedTuple):
     """
 
     arrays: dict[str, np.ndarray]
-    valid: np.ndarray  # (T, B) bool, False after a game's end
+    valid: np.ndarray  # (T, B) bool, False after a game's end, and where an agent goes on waiting at the depot
 
     def decisions(self, device: torch.device | str) -> tuple[TensorDictBase, torch.Tensor]:
         """A TensorDict [T, B] with everything that is learnt from, and valid (T, B)."""
@@ -72,10 +72,23 @@ def teach(config: ImitateConfig, rng: np.random.Generator, problem: Problem) -> 
         seen = {key: state[key] for key in env.observation_spec.keys() if key != "game"}  # noqa: SIM118 (no dict)
         seen["destination"] = state["game", "destination"]
         decisions.append({key: tensor.numpy() for key, tensor in seen.items()} | labels)
-        valid.append(~over.numpy())
+        valid.append((~over & ~_goes_on_waiting(state, torch.as_tensor(labels["action"]))).numpy())
         state = env.step(state.set("action", torch.as_tensor(labels["action"])))["next"]
         over = over | state["done"][:, 0]
-    return Lessons({key: np.stack([one[key] for one in decisions]) for key in decisions[0]}, np.stack(valid))
+    kept = [step for step, rows in enumerate(valid) if rows.any()]
+    arrays = {key: np.stack([one[key] for one in decisions])[kept] for key in decisions[0]}
+    return Lessons(arrays, np.stack(valid)[kept])
+
+
+def _goes_on_waiting(state: TensorDictBase, action: torch.Tensor) -> torch.Tensor:
+    """(B,) bool: whether the deciding agent has been at the depot before and stays there.
+
+    Those who wait are asked again and again. If all these decisions were learnt from, they would outnumber the others,
+    and the network would rather stay at home whenever it doubts.
+    """
+    agent, game = state["agent"][:, None], state["game"]
+    has_waited = (game["destination"].gather(1, agent) == 0) & (game["leg"].gather(1, agent) == 0.0)
+    return has_waited[:, 0] & (action == 0)
 
 
 @torch.no_grad()
