@@ -1,6 +1,7 @@
 """Two processes take the step that one would take with all their episodes; they stop and decide together."""
 
 import os
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.processes import wait_until
 from helpers.states import same
 
 from dan_policy import DAN, DANConfig, make_actor
@@ -32,9 +34,9 @@ def torchrun(*arguments, processes=2):
     return done.stderr
 
 
-SMALL = ["-m", "train", "reinforce", "quick", "--n-nodes", 5, 7, "--batch-size", 4, "--network.embed-dim", 16,
-         "--challenge-instances", 8, "--challenge-every", 2, "--validation-instances", 4,
-         "--no-tensorboard"]  # fmt: skip
+TINY_RUN = ["-m", "train", "reinforce", "quick", "--n-nodes", 5, 7, "--batch-size", 4, "--network.embed-dim", 16,
+            "--validation-instances", 4, "--no-tensorboard"]  # fmt: skip
+SMALL = [*TINY_RUN, "--challenge-instances", 8, "--challenge-every", 2]
 
 
 def gradient(network, seeds):
@@ -109,6 +111,25 @@ def test_a_damaged_checkpoint_sends_all_processes_back_to_the_one_before(tmp_pat
             assert same(whole[part], again[part]), (name, part)
     steps = np.loadtxt(tmp_path / "damaged" / "logs" / "scalars" / "cost.csv", delimiter=",")[:, 0]
     assert steps.tolist() == [1, 2, 3, 4]
+
+
+@pytest.mark.slow
+def test_a_signal_to_all_processes_and_torchrun_saves_the_same_step_in_each(tmp_path):
+    """Each gets the signal twice: from whoever ends the job, and from torchrun. Steps end with a long challenge."""
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", *map(str, TINY_RUN)]
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    options = ["--checkpoint-every", "100000", "--steps", "100000", "--out", str(tmp_path)]
+    options += ["--challenge-every", "1", "--challenge-instances", "2000"]
+    job = subprocess.Popen(
+        [*command, *options], cwd=ROOT, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    log = tmp_path / "logs" / "scalars" / "cost.csv"
+    wait_until(lambda: log.exists() and log.read_text().count("\n") >= 1)
+    os.killpg(job.pid, signal.SIGTERM)
+    _, errors = job.communicate(timeout=300)
+    assert errors.count("train: ended by SIGTERM") == 2, errors
+    steps = [checkpoint.read(tmp_path / name)["progress"]["step"] for name in ("checkpoint.pt", "checkpoint-1.pt")]
+    assert steps == [log.read_text().count("\n")] * 2
 
 
 def test_processes_without_a_common_checkpoint_all_say_so(tmp_path, monkeypatch):

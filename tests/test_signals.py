@@ -10,8 +10,8 @@ import psutil
 import pytest
 from helpers.processes import alive, children, wait_until
 
-from train import checkpoint
-from train.interrupts import postponed
+from train import checkpoint, interrupts
+from train.interrupts import ENDING, postponed
 
 ROOT = Path(__file__).parent.parent
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
@@ -103,17 +103,42 @@ def test_label_workers_end_with_their_killed_parent(tmp_path):
     wait_until(lambda: not any(map(alive, started)))
 
 
-def test_a_postponed_signal_is_raised_after_the_block():
+@pytest.fixture
+def seen():
+    """The signals that reach the handlers from before a block that postpones them."""
     seen = []
-    before = signal.signal(signal.SIGTERM, lambda number, _: seen.append(number))
-    try:
-        with postponed(signal.SIGTERM) as caught:
-            signal.raise_signal(signal.SIGTERM)
-            assert caught == [signal.SIGTERM] and seen == []
-        assert seen == [signal.SIGTERM]
-        with postponed(signal.SIGTERM):
-            signal.raise_signal(signal.SIGTERM)
-            signal.raise_signal(signal.SIGTERM)  # the second does not wait
-            assert seen == [signal.SIGTERM] * 2
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    before = {number: signal.signal(number, lambda number, _: seen.append(number)) for number in ENDING}
+    yield seen
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("number", ENDING)
+def test_a_postponed_signal_is_raised_once_after_the_block(seen, number):
+    """Also if it comes twice, as under torchrun, which passes on the signals that its processes have got already."""
+    with postponed(*ENDING) as caught:
+        signal.raise_signal(number)
+        signal.raise_signal(number)
+        assert caught == [number, number] and seen == []
+    assert seen == [number]
+
+
+def test_a_later_ctrl_c_does_not_wait(seen, monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr(interrupts.time, "monotonic", lambda: clock[0])
+    with postponed(*ENDING):
+        signal.raise_signal(signal.SIGTERM)
+        clock[0] = 60.0
+        signal.raise_signal(signal.SIGTERM)
+        assert seen == []
+        signal.raise_signal(signal.SIGINT)
+        assert seen == [signal.SIGINT]
+
+
+def test_ignored_signals_stay_ignored(seen):
+    """As ``nohup`` ignores SIGHUP."""
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    with postponed(*ENDING) as caught:
+        signal.raise_signal(signal.SIGHUP)
+        assert caught == []
+    assert seen == []

@@ -6,12 +6,15 @@ This module imports nothing heavy, so that ``python -m train`` can handle signal
 
 from __future__ import annotations
 
+import math
 import signal
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+AT_ONCE = 3.0  # seconds
 
 
 def exit_on_signals() -> None:
@@ -34,17 +37,21 @@ def exit_on_signals() -> None:
 def postponed(*numbers: int) -> Iterator[list[int]]:
     """Collect signals; after the block, the first is raised again for the handler that was there before.
 
-    A second signal does not wait for the end of the block. Signals that are ignored stay so.
+    A second Ctrl-C does not wait for the end of the block, unless it comes at once: torchrun sends its processes the
+    signal that all of them have already got from a terminal or a job scheduler. Signals that are ignored stay so.
 
     >>> with postponed(signal.SIGINT) as caught:
     ...     while not caught:
     ...         work()
     """
     caught: list[int] = []
+    first = math.inf  # time of the first signal
 
     def collect(number: int, _frame: object) -> None:
+        nonlocal first
         caught.append(number)
-        if len(caught) > 1:
+        first = min(first, time.monotonic())
+        if number == signal.SIGINT and time.monotonic() > first + AT_ONCE:
             restore()
             signal.raise_signal(number)
 
