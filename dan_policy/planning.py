@@ -24,7 +24,7 @@ from dan_policy.registry import find, load, network_name
 from dan_policy.symmetry import SYMMETRIES
 from mtsp_env import rules
 from mtsp_env.checks import check_count, check_seconds
-from mtsp_env.instance import Instance, Tours, check_plain
+from mtsp_env.instance import Instance, Tours, check_plannable
 from mtsp_env.machine import check_memory
 from mtsp_env.tours import check_prefixes, check_tours, makespan
 
@@ -140,16 +140,16 @@ def solve(
         ImportError: ``improve`` without Numba.
         OSError: no such weights.
         TypeError: an option that does not exist.
-        ValueError: an instance with world fields, bad weights, an option outside its range, one that the policy does
-            not have, or games that do not fit into the memory.
+        ValueError: world fields other than ``speeds`` and ``service``, bad weights, an option outside its range, one
+            that the policy does not have, or games that do not fit into the memory.
     """
-    check_plain(instance)
+    check_plannable(instance.world)
     options = replace(options or SolveOptions(), **changes)
     check_memory("n_agents", instance.n_agents, BYTES_PER_AGENT)
     begun = [] if prefixes is None else check_prefixes(instance, prefixes)
     team = instance if begun else without_spare_agents(instance)
     check_memory("samples", options.games, BYTES_PER_GAME_AND_NODE * (instance.n_nodes + team.n_agents))
-    improve = _improvement(options, begun)
+    improve = _improvement(options, begun, instance)
     device = find_device(options.device)
     named = isinstance(policy, (str, os.PathLike))  # a network that is nobody else's
     policy = _placed(_loaded(policy, device), device)
@@ -169,20 +169,23 @@ def solve(
 
 
 def without_spare_agents(instance: Instance) -> Instance:
-    """A plain instance with at most one agent per city; others would never leave by the rule "final".
+    """The instance with at most one agent per city; others would never leave by the rule "final".
 
-    All agents decide at the start, in their order, and each of them picks a city while there are any.
+    All agents decide at the start, in their order, and each of them picks a city while there are any. A team whose
+    agents differ in speed stays as it is.
     """
+    if instance.speeds is not None:
+        return instance
     return replace(instance, n_agents=min(instance.n_agents, instance.n_nodes - 1))
 
 
-def _improvement(options: SolveOptions, prefixes: Tours) -> Callable[[Instance, Tours], Tours]:
+def _improvement(options: SolveOptions, prefixes: Tours, problem: Instance) -> Callable[[Instance, Tours], Tours]:
     """The reference solver for ``improve`` seconds, its kernels compiled; without ``improve``, nothing."""
     if options.improve is None:
         return lambda instance, tours: tours
     from mtsp_env import reference  # needs Numba
 
-    reference.compile_kernels()
+    reference.compile_kernels(worlds=problem.world != ())
     return partial(reference.improve, seconds=options.improve, seed=options.seed, prefixes=prefixes or None)
 
 

@@ -293,6 +293,16 @@ def check_plain(problem: Instance | Problem) -> None:
         raise ValueError(f"only plain problems can be solved and bounded, this one has the world fields {world}")
 
 
+def check_plannable(world: Sequence[str]) -> None:
+    """Raise ValueError if no tours can be planned in advance in a world with these fields, because it changes."""
+    changing = [name for name in world if name not in ("speeds", "service")]
+    if changing:
+        raise ValueError(
+            f"tours cannot be planned in advance in a world with {changing}: mtsp_env.replan.Replanner plans again "
+            "whenever something happens"
+        )
+
+
 def from_coordinates(xy: np.ndarray | Sequence, n_agents: int, name: str = "") -> Instance:
     """Bring any planar coordinates (n, 2) to the unit square; ``scale`` keeps their units.
 

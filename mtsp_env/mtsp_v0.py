@@ -14,7 +14,7 @@ from pettingzoo.utils import wrappers
 
 from mtsp_env import rules, world
 from mtsp_env.distributions import Generator, check_distribution, distribution_name, sample, scenario_shapes
-from mtsp_env.instance import Instance, Problem, Tours, batch
+from mtsp_env.instance import Instance, Problem, Tours, batch, check_plannable
 from mtsp_env.log import write_log
 from mtsp_env.tours import Log, makespan
 
@@ -79,9 +79,10 @@ class raw_env(AECEnv):
         distribution: where the nodes lie: a key of ``mtsp_env.DISTRIBUTIONS``, or a function ``(rng, batch, n_nodes,
             n_agents) -> dict of arrays``, see ``mtsp_env.distributions``.
         render_mode: None, "rgb_array" or "human" (both need the extra ``render``).
-        reference: measure regret. ``mtsp_env.reference.improve`` solves the instance as its first episode ends, with
-            its default iterations and seed, so the same instance always has the same ``reference_makespan``: about
-            0.1 s at n = 50, 3 s at n = 1000 (extra ``reference``).
+        reference: measure regret, in the plain problem or a world whose only fields are ``speeds`` and ``service``.
+            ``mtsp_env.reference.improve`` solves the instance as its first episode ends, with its default iterations
+            and seed, so the same instance always has the same ``reference_makespan``: about 0.1 s at n = 50, 3 s at
+            n = 1000 (extra ``reference``).
         info_tours: put ``tours`` into the last infos as well. Lists of unequal lengths break the batches of some
             libraries.
         scenario: the world: a key of ``mtsp_env.SCENARIOS``, or a function of the same form. It decides which world
@@ -131,8 +132,7 @@ class raw_env(AECEnv):
         if reference:
             import mtsp_env.reference  # noqa: F401  says at once if Numba is missing
 
-            if self.world:
-                raise ValueError(f"reference solves plain instances only, scenario {scenario!r} has {self.world}")
+            check_plannable(self.world)
         self.n_nodes, self.n_agents = n_nodes, n_agents
         self.distribution, self.scenario, self.render_mode = distribution, scenario, render_mode
         self.reference, self.info_tours = reference, info_tours

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mtsp_env.instance import Instance, Tours, check_plain
+from mtsp_env.instance import Instance, Tours, check_plannable
 from mtsp_env.spanning_tree import spanning_tree_length
 
 TOLERANCE = 1e-6  # of the times in a log
@@ -166,17 +166,31 @@ def farthest_trip(nodes: np.ndarray) -> float:
     return 2.0 * float(np.linalg.norm(nodes - nodes[0], axis=1).max())
 
 
-def lower_bound(instance: Instance) -> float:
-    """A lower bound on the makespan: the larger of ``farthest_trip`` and the minimum spanning tree's length over m.
+def longest_trip(instance: Instance) -> float:
+    """A lower bound on the makespan: the fastest agent goes to one city, visits it and comes home."""
+    if not instance.world:
+        return farthest_trip(instance.nodes)
+    fastest = 1.0 if instance.speeds is None else float(instance.speeds.max())
+    visits = 0.0 if instance.service is None else instance.service
+    return float((2.0 * np.linalg.norm(instance.nodes - instance.nodes[0], axis=1) / fastest + visits).max())
 
-    The m tours together contain a spanning tree of all nodes, so the longest is at least the tree's length over m. For
-    time and memory see ``spanning_tree_length``.
+
+def lower_bound(instance: Instance) -> float:
+    """A lower bound on the makespan: the larger of ``longest_trip`` and what all tours need together, shared evenly.
+
+    The tours together contain a spanning tree of all nodes, and all visits: without world fields, the longest of the m
+    tours is at least the tree's length over m. For time and memory see ``spanning_tree_length``.
 
     Raises:
-        ValueError: the instance is not plain.
+        ValueError: the instance has other world fields than ``speeds`` and ``service``.
     """
-    check_plain(instance)
-    return max(farthest_trip(instance.nodes), spanning_tree_length(instance.nodes) / instance.n_agents)
+    check_plannable(instance.world)
+    length, speed = spanning_tree_length(instance.nodes), float(instance.n_agents)  # of the whole team
+    if instance.speeds is not None:
+        speed = float(instance.speeds.sum())
+    if instance.service is not None:  # an agent that visits cannot drive: time s costs at least s times the least speed
+        length += float(instance.service.sum()) * (1.0 if instance.speeds is None else float(instance.speeds.min()))
+    return max(longest_trip(instance), length / speed)
 
 
 # Logs

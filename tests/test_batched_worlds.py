@@ -11,9 +11,10 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs, step_mdp
 
 from dan_policy import load, rollout, solve
-from mtsp_env import SCENARIOS, Instance, rules
+from mtsp_env import SCENARIOS, Instance, lower_bound, rules
 from mtsp_env.batched import BatchedMTSP
-from mtsp_env.distributions import sample
+from mtsp_env.distributions import sample, service, team
+from mtsp_env.instance import Problem
 
 OPTIONS = [{}, {"view": 3, "hearing": 0.4}]
 in_every_scenario = pytest.mark.parametrize("scenario", SCENARIOS)
@@ -85,12 +86,35 @@ def test_networks_that_know_no_worlds_play_in_each(scenario: str, name: str) -> 
     assert torch.allclose(-episode.reward, env.makespan(episode.last).float())
 
 
-@pytest.mark.parametrize("field", ["speeds", "appears"])
-def test_policies_plan_no_worlds(field: str) -> None:
-    value = {"speeds": [1.0, 2.0], "appears": [0.0, 0.5, 0.0]}[field]
+@pytest.mark.parametrize("field", ["appears", "breaks", "traffic"])
+def test_policies_plan_no_worlds_that_change(field: str) -> None:
+    value = {"appears": [0.0, 0.5, 0.0], "breaks": [np.inf, 1.0], "traffic": [[1.0], [2.0]]}[field]
     world = Instance([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], 2, **{field: value})
-    with pytest.raises(ValueError, match=rf"only plain problems .* world fields \['{field}'\]"):
+    with pytest.raises(ValueError, match=rf"cannot be planned in advance in a world with \['{field}'\]"):
         solve(world)
+
+
+def test_policies_plan_for_teams_that_differ_and_visits_that_take_time() -> None:
+    """The makespan is that of the same greedy game in the batched environment; improving never makes it worse."""
+    env = BatchedMTSP(12, 3, [4], scenario=team_and_service, depot="final", seed=1)
+    start = env.reset()
+    game = {name: start["game", name].clone() for name in ("nodes", "speeds", "service")}
+    episode = rollout(load("default"), env, "greedy", Problem(3, game))
+    for row, makespan in enumerate(env.makespan(episode.last).tolist()):
+        instance = Instance(n_agents=3, **{name: array[row].numpy() for name, array in game.items()})
+        solution = solve(instance, "default", device="cpu")
+        assert solution.makespan == pytest.approx(makespan, abs=1e-9)
+        assert lower_bound(instance) <= solve(instance, "default", device="cpu", improve=0.01).makespan <= makespan
+
+
+def test_more_agents_than_cities_differ_in_speed() -> None:
+    instance = Instance([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], 4, speeds=[1.0, 2.0, 0.5, 3.0])
+    tours = solve(instance, device="cpu").tours
+    assert len(tours) == 4 and sorted(city for tour in tours for city in tour if city) == [1, 2]
+
+
+def team_and_service(rng: np.random.Generator, batch: int, n_nodes: int, n_agents: int) -> dict[str, np.ndarray]:
+    return team(rng, batch, n_nodes, n_agents) | service(rng, batch, n_nodes, n_agents)
 
 
 @pytest.mark.slow

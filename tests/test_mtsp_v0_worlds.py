@@ -168,7 +168,7 @@ def test_an_instance_of_another_world_is_refused() -> None:
     [
         ({"scenario": "rain"}, "unknown scenario 'rain'"),
         ({"scenario": "arrivals", "depot": "final"}, "cannot be played in a world with .'appears'."),
-        ({"scenario": "team", "reference": True}, "reference solves plain instances only"),
+        ({"scenario": "traffic", "reference": True}, "tours cannot be planned in advance in a world with .'traffic'."),
         ({"view": 0}, "view must be a whole number of at least 1, got 0"),
         ({"hearing": -1.0}, "hearing must be a finite distance"),
     ],

@@ -89,3 +89,15 @@ def test_without_numba_creation_fails_and_names_the_extra(monkeypatch: pytest.Mo
     monkeypatch.setitem(sys.modules, "numba", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'mtsp-env\[reference\]'"):
         mtsp_v0.env(reference=True)
+
+
+@pytest.mark.parametrize("scenario", ["team", "service"])
+def test_regret_in_worlds_that_do_not_change(searches: list, scenario: str) -> None:
+    env = mtsp_v0.env(n_nodes=7, n_agents=2, scenario=scenario, reference=True)
+    for seed in range(3):
+        env.reset(seed=seed)
+        play(env)
+        info, instance = env.infos["agent_0"], env.unwrapped.instance
+        assert instance.world and searches[-1] == instance
+        assert lower_bound(instance) <= info["reference_makespan"] <= info["makespan"] + 1e-9
+        assert info["regret"] == pytest.approx(info["makespan"] / info["reference_makespan"] - 1.0)

@@ -143,6 +143,11 @@ def test_no_solution_is_below_the_bound(instance: Instance) -> None:
 def test_the_bound_by_hand(square: Instance) -> None:
     assert lower_bound(square) == 1.5  # a tree of 6 edges of 0.5, shared by two; the corners are only 0.707 away
     assert lower_bound(Instance(square.nodes, 3)) == math.sqrt(2.0)  # now the trip to a corner is longer
+    twice = Instance(square.nodes, 2, speeds=[2.0, 2.0], service=[0.0] + [0.1] * 6)
+    assert lower_bound(twice) == pytest.approx((3.0 + 6 * 0.1 * 2.0) / 4.0)  # the same tree, and six visits
+    slow = Instance(square.nodes, 2, speeds=[0.1, 0.2], service=[0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert lower_bound(slow) == pytest.approx((3.0 + 0.1) / 0.3)
+    assert lower_bound(Instance(square.nodes, 2, service=slow.service * 3)) == pytest.approx(math.sqrt(2.0) + 3.0)
     ell = Instance([[0.0, 0.0], [0.0, 1.0], [1.0, 1.0], [1.0, 0.0]], 1)
     assert lower_bound(ell) == 3.0
 

@@ -17,12 +17,12 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from mtsp_env.checks import check_count, check_seconds
-from mtsp_env.instance import Instance, Tours, check_arrays
+from mtsp_env.instance import Instance, Tours, check_arrays, check_plannable
 from mtsp_env.machine import check_memory, usable_cores
 from mtsp_env.reference import sisr
 from mtsp_env.reference.annealing import optimise
 from mtsp_env.reference.search import as_order, as_tours, new_search, place_agents, remaining_order
-from mtsp_env.tours import check_prefixes, check_tours, farthest_trip, is_closed, makespan, tour_times
+from mtsp_env.tours import check_prefixes, check_tours, is_closed, longest_trip, makespan, tour_times
 
 BYTES_PER_NODE, BYTES_PER_AGENT = 2000, 200  # measured: what a search needs at its peak, with its tours as lists
 
@@ -68,7 +68,7 @@ def improve(
             tours that solve it begin with the prefixes, a number is outside its range, or the search does not fit into
             the memory.
     """
-    _check_world(instance.world)
+    check_plannable(instance.world)
     if seconds is not None:
         check_seconds("seconds", seconds)
     _check_search(iterations, seed)
@@ -182,15 +182,6 @@ def plan_rest(
     )
 
 
-def _check_world(world: Sequence[str]) -> None:
-    changing = [name for name in world if name not in ("speeds", "service")]
-    if changing:
-        raise ValueError(
-            f"tours cannot be planned in advance in a world with {changing}: mtsp_env.replan.Replanner plans again "
-            "whenever something happens"
-        )
-
-
 def _check_stopped(instance: Instance, prefixes: Tours | None, stopped: Collection[int]) -> Tours:
     """The prefixes, by default of agents that have not left; ValueError unless the other agents can visit the rest."""
     for agent in stopped:
@@ -238,7 +229,7 @@ def _solve(
     """``improve`` without its checks."""
     started = time.perf_counter()
     n, m = instance.n_nodes, instance.n_agents
-    bound = _farthest_trip(instance)  # the other part of tours.lower_bound, the spanning tree, is never attained
+    bound = longest_trip(instance)  # the other part of tours.lower_bound, the spanning tree, is never attained
     if prefixes is None and instance.speeds is None:
         # At most one agent per city is of use
         search = new_search(instance.nodes, min(m, n - 1), seed, service=instance.service)
@@ -260,15 +251,6 @@ def _solve(
         prefix if final[agent] else [*prefix, *route, 0]
         for agent, (prefix, route) in enumerate(zip(prefixes, rest, strict=True))
     ]
-
-
-def _farthest_trip(instance: Instance) -> float:
-    """A lower bound on the makespan: the fastest agent goes to a city and home."""
-    if instance.world == ():
-        return farthest_trip(instance.nodes)
-    fastest = 1.0 if instance.speeds is None else float(instance.speeds.max())
-    visits = 0.0 if instance.service is None else instance.service
-    return float((2.0 * np.linalg.norm(instance.nodes - instance.nodes[0], axis=1) / fastest + visits).max())
 
 
 def _plan_rest(
