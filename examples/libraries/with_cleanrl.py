@@ -1,14 +1,16 @@
 """PPO with an action mask in one file, as CleanRL writes it: needs torch alone.
 
-Eight games are played side by side through Gymnasium's vector API. One network decides for all agents.
+Eight games are played side by side through Gymnasium's vector API. One network decides for all agents. It finds the
+cities in the flat observation again, to treat them all alike.
 """
 
 import time
+from itertools import pairwise
 
 import gymnasium
 import numpy as np
 import torch
-from compare import arguments, compare, flat, make_env
+from compare import GAME, arguments, compare, flat, make_env
 from torch import nn
 from torch.distributions import Categorical
 
@@ -21,18 +23,30 @@ envs = gymnasium.vector.SyncVectorEnv(
     [lambda: gymnasium.wrappers.FlattenObservation(make_env())] * n_envs,
     autoreset_mode=gymnasium.vector.AutoresetMode.SAME_STEP,  # a step that ends a game returns the start of the next
 )
-size, n_nodes = envs.single_observation_space.shape[0], envs.single_action_space.n
+size, n_nodes = envs.single_observation_space.shape[0], int(envs.single_action_space.n)
+sizes = [GAME["n_agents"], 3 * GAME["n_agents"], 2 * n_nodes, n_nodes]  # of agent, agents, cities, visited
 
 
-def mlp(outputs: int, last_std: float) -> nn.Sequential:
-    layers = [nn.Linear(size, 128), nn.Tanh(), nn.Linear(128, 128), nn.Tanh(), nn.Linear(128, outputs)]
-    for layer in layers[::2]:
-        nn.init.orthogonal_(layer.weight, last_std if layer is layers[-1] else 2**0.5)
-        nn.init.zeros_(layer.bias)
-    return nn.Sequential(*layers)
+def mlp(*widths: int) -> nn.Sequential:
+    layers = [layer for pair in pairwise(widths) for layer in (nn.Linear(*pair), nn.Tanh())]
+    return nn.Sequential(*layers[:-1])
 
 
-actor, critic = mlp(n_nodes, last_std=0.01), mlp(1, last_std=1.0)
+class Actor(nn.Module):
+    """Scores each node by the same network, so that what it learns about one holds for all: (B, size) -> (B, n)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.score = mlp(2 + 1 + 2 + 3 * GAME["n_agents"], 64, 64, 1)
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        _, agents, cities, visited = observation.split(sizes, 1)
+        cities = cities.unflatten(1, (n_nodes, 2))  # (B, n, 2), the depot first
+        from_depot, everybody = cities - cities[:, :1], agents[:, None].expand(-1, n_nodes, -1)
+        return self.score(torch.cat([cities, visited[..., None], from_depot, everybody], 2))[..., 0]
+
+
+actor, critic = Actor(), mlp(size, 128, 128, 1)
 parameters = [*actor.parameters(), *critic.parameters()]
 optimiser = torch.optim.Adam(parameters, lr=1e-3, eps=1e-5)
 
@@ -89,7 +103,7 @@ seconds = time.process_time() - start
 
 @torch.no_grad()
 def greedy(observation: dict[str, np.ndarray], mask: np.ndarray) -> int:
-    return policy(torch.as_tensor(flat(observation)), torch.as_tensor(mask)).logits.argmax().item()
+    return policy(torch.as_tensor(flat(observation))[None], torch.as_tensor(mask)).logits.argmax().item()
 
 
 compare("cleanrl", greedy, updates * n_steps * n_envs, seconds)
