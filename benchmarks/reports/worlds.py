@@ -55,7 +55,10 @@ def write_report(folder: Path) -> None:
         ]
     parts += [
         "## What it costs, and what it needs to know",
-        "CPU time with one thread. A planner's decisions are quick unless it searches; all agents wait for its search.",
+        "CPU time with one thread, which other work on the machine disturbs little. A planner's decisions are quick "
+        "unless it searches: its last column is the time of all its decisions over its number of searches, at the "
+        "size at which that is longest. A search has as many iterations as one core does in its milliseconds with "
+        "half of the cities open.",
         costs(games, sizes),
     ]
     write_text(folder / "report.md", "\n\n".join(parts) + "\n")
@@ -113,7 +116,7 @@ def _mean(values: np.ndarray, decimals: int, count: int) -> str:
 
 def costs(games: Games, sizes: list[str]) -> str:
     """The table of decisions per second, of the time of a search, and of what each method needs to know."""
-    head = ["", "needs to know", *(f"decisions per second, {size}" for size in sizes), "longest mean search, ms"]
+    head = ["", "needs to know", *(f"decisions per second, {size}" for size in sizes), "ms per search"]
     lines = []
     for method, cells in games.items():
         rates, longest = [], 0.0
