@@ -67,9 +67,10 @@ class JointConfig:
         check_clip(self.tanh_clip)
         if self.view is not None and not (type(self.view) is int and self.view >= 1):
             raise ValueError(f"view must be None or at least 1 city, got {self.view!r}")
-        object.__setattr__(self, "reads", tuple(self.reads))  # JSON has lists only
-        if not set(self.reads) <= set(READABLE) or len(set(self.reads)) < len(self.reads):
-            raise ValueError(f"reads must be different keys of {list(READABLE)}, got {list(self.reads)}")
+        keys = list(self.reads) if isinstance(self.reads, (list, tuple)) else [self.reads]
+        if not all(key in READABLE for key in map(str, keys)) or len(set(keys)) < len(keys):
+            raise ValueError(f"reads must be different keys of {list(READABLE)}, got {self.reads!r}")
+        object.__setattr__(self, "reads", tuple(keys))  # JSON has lists only
 
 
 class JointDAN(nn.Module):

@@ -178,7 +178,7 @@ def test_the_default_has_about_a_million_parameters():
         ({"n_layers": 0}, "n_layers must be a whole number from 1 to 1000, got 0"),
         ({"tanh_clip": 0.0}, r"tanh_clip must be a number above 0 and at most 1e\+06, got 0.0"),
         ({"view": 0}, "view must be None or at least 1 city, got 0"),
-        ({"reads": ("moon",)}, r"reads must be different keys of \['agent_speeds', .*\], got \['moon'\]"),
+        ({"reads": ("moon",)}, r"reads must be different keys of \['agent_speeds', .*\], got \('moon',\)"),
         ({"reads": ("service", "service")}, r"reads must be different keys"),
     ],
 )
