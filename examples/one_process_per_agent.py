@@ -145,7 +145,8 @@ def make_policy(name: str) -> Policy:
 
     @torch.no_grad()
     def likeliest(seen: dict[str, np.ndarray]) -> int:
-        logits = network(*(torch.as_tensor(seen[key])[None] for key in network_keys(network)))[0]
+        values = (seen.get(key) for key in network_keys(network))  # None: what this world does not have
+        logits = network(*(None if value is None else torch.as_tensor(value)[None] for value in values))[0]
         return int(logits.masked_fill(~torch.as_tensor(seen["action_mask"]), -torch.inf).argmax())
 
     return likeliest
