@@ -62,6 +62,7 @@ PAGES_OF_FILES = {
     "../benchmarks/results/seed3333/report.md": "measured/seed3333.md",
     "../benchmarks/results/table1-100/report.md": "measured/table1-100.md",
     "../benchmarks/results/view.md": "measured/view.md",
+    "../benchmarks/results/worlds/report.md": "measured/worlds.md",
 }
 LINK = re.compile(r"(?<!!)\[(?P<text>[^\]]*)\]\((?P<target>[^)#\s]+)(?P<anchor>#[^)\s]*)?\)")  # but no pictures
 
