@@ -224,7 +224,8 @@ def play(instance: Instance, policy: str = "nearest", speed: float = 0.01) -> tu
     """Play an instance with a process for each agent; returns the decisions, and the environment at the end.
 
     Args:
-        instance: of a world with the fields of ``world_of_arrivals``; agents are killed when they break down.
+        instance: an instance with the world fields of ``world_of_arrivals``. The process of an agent that breaks down
+            is killed.
         policy: as for ``make_policy``.
         speed: distance per tick.
     """

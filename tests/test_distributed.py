@@ -115,7 +115,10 @@ def test_a_damaged_checkpoint_sends_all_processes_back_to_the_one_before(tmp_pat
 
 @pytest.mark.slow
 def test_a_signal_to_all_processes_and_torchrun_saves_the_same_step_in_each(tmp_path):
-    """Each gets the signal twice: from whoever ends the job, and from torchrun. Steps end with a long challenge."""
+    """Each process gets the signal twice: once from the job's scheduler and once from torchrun.
+
+    Steps end with a long challenge.
+    """
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", *map(str, TINY_RUN)]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     options = ["--checkpoint-every", "100000", "--steps", "100000", "--out", str(tmp_path)]

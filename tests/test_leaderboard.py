@@ -184,7 +184,10 @@ def test_games_in_worlds_are_played_again(tmp_path, few_worlds):
         (lambda games: games.pop(), "everything 8x2 has 2 instances, got the decisions of 1"),
         (lambda games: games[1].clear(), "everything 8x2, instance 1: expected 1 to 200 nodes from 0 to 7"),
         (lambda games: games[1].append(8), "everything 8x2, instance 1: expected 1 to 200 nodes from 0 to 7"),
-        (lambda games: games[0].__delitem__(slice(4, None)), "everything 8x2, instance 0: "),
+        (lambda games: games[0].__delitem__(slice(4, None)), "instance 0: the game is not over after 4 decisions"),
+        (lambda games: games[0].append(0), r"instance 0: the game is over after \d+ decisions"),
+        (lambda games: games[0].insert(1, games[0][0]), r"instance 0: decision 1: agent 1 may not go to node \d"),
+        (lambda games: games.__setitem__(0, [0] * 200), r"instance 0: decision 0: agent 0 may not go to node 0"),
     ],
 )
 def test_games_that_break_a_rule_are_refused(tmp_path, few_worlds, change, message):

@@ -68,8 +68,8 @@ def _check_unused(config: RunConfig) -> None:
 def run(learner: Learner) -> None:
     """Train until the configured steps or seconds are over, or a signal comes; log, and save in any case.
 
-    A signal (Ctrl-C, SIGTERM or SIGHUP) that ends the run is raised again after everything is saved, for whoever
-    handled it before.
+    A signal (Ctrl-C, SIGTERM or SIGHUP) ends the run. Once everything is saved, it is raised again for the handler that
+    was there before.
     """
     with closing(learner):
         if learner.config.resume:

@@ -35,7 +35,8 @@ class CellResult(msgspec.Struct, forbid_unknown_fields=True):
     Attributes:
         seconds: mean wall time of one instance; null: not measured.
         tours: the tours of each instance, in the test set's order.
-        decisions: of the test set "worlds" instead of tours: the nodes that the agents picked in each game, in turn.
+        decisions: for the test set "worlds", which has no tours: the nodes that the agents picked in each game, in
+            turn.
     """
 
     seconds: Annotated[float, Meta(ge=0)] | None

@@ -13,12 +13,12 @@ class PlanOnce:
     """A policy for one game: the reference solver plans at its first decision, and never again.
 
     A city that has appeared since, or that a broken agent leaves behind, goes to the living agent whose destination is
-    nearest, which visits it where that makes its route longest by least. An agent without cities goes home and waits;
-    if it must leave the depot, it takes its nearest open city from whoever has it.
+    nearest. That agent inserts it where it lengthens the route least. An agent without cities goes home and waits.
+    If an agent must leave the depot, it takes its nearest open city from the agent that has it.
 
     Args:
-        iterations: of the search for the plan, at least 0.
-        seed: of that search.
+        iterations: number of iterations of the search for the plan, at least 0.
+        seed: seed of that search.
     """
 
     def __init__(self, iterations: int, seed: int = 0):

@@ -56,7 +56,7 @@ class Cell:
 
     @property
     def rules(self) -> rules.Rules:
-        """Those of its games; agents with nothing to do wait until something happens."""
+        """The rules of its games; agents with nothing to do wait until something happens."""
         return rules.make_rules(self.n_nodes, self.n_agents, SPEED, "wait", "sparse", None)
 
     def instance(self, number: int) -> Instance:
@@ -72,7 +72,7 @@ class Cell:
 def play(instance: Instance, game_rules: rules.Rules, decide: Decide) -> tuple[list[int], float]:
     """The decisions of one game, and the CPU seconds that ``decide`` took for them."""
     state, decisions, seconds = rules.start(batch([instance]), game_rules), [], 0.0
-    while not (rules.terminated(state) | rules.truncated(state, game_rules)).all():
+    while not _over(state, game_rules).all():
         start = time.process_time()
         node = decide(state, game_rules)
         seconds += time.process_time() - start
@@ -82,10 +82,10 @@ def play(instance: Instance, game_rules: rules.Rules, decide: Decide) -> tuple[l
 
 
 def play_together(problem: Problem, game_rules: rules.Rules, choose: Choose) -> list[list[int]]:
-    """The decisions of the games of a problem, played side by side; nobody is asked who has no choice."""
+    """The decisions of the games of a problem, played side by side. ``choose`` is asked only if there is a choice."""
     state = rules.start(problem, game_rules)
     decisions: list[list[int]] = [[] for _ in range(len(problem.nodes))]
-    while not (over := rules.terminated(state) | rules.truncated(state, game_rules)).all():
+    while not (over := _over(state, game_rules)).all():
         seen = rules.observe(state, game_rules)
         actions, asked = seen.action_mask.argmax(1), ~over & (seen.action_mask.sum(1) > 1)
         if asked.any():
@@ -101,15 +101,27 @@ def judge(instance: Instance, game_rules: rules.Rules, decisions: list[int]) -> 
     """The makespan of a game, and whether it was cut off.
 
     Raises:
-        ValueError: decisions that break a rule.
+        ValueError: an illegal decision, or too few or too many of them.
     """
     problem = batch([instance])
-    if len(decisions) < game_rules.max_decisions:
-        return check_log(instance, write_log(problem, game_rules, decisions, close=True), game_rules.speed), False
     state = rules.start(problem, game_rules)
-    for node in decisions:
-        state = rules.depart(state, game_rules, np.array([node]))
-    return float(rules.final_cost(state, game_rules)[0]), bool(rules.truncated(state, game_rules)[0])
+    for count, node in enumerate(decisions):
+        if _over(state, game_rules).all():
+            raise ValueError(f"the game is over after {count} decisions, got {len(decisions)}")
+        agent, action = rules.agent_to_decide(state), np.array([node])
+        if not rules.are_legal(action, rules.legal_actions(state, game_rules, agent))[0]:
+            raise ValueError(f"decision {count}: agent {agent[0]} may not go to node {node}")
+        state = rules.depart(state, game_rules, action)
+    if not _over(state, game_rules).all():
+        raise ValueError(f"the game is not over after {len(decisions)} decisions")
+    if rules.truncated(state, game_rules)[0]:
+        return float(rules.final_cost(state, game_rules)[0]), True
+    return check_log(instance, write_log(problem, game_rules, decisions, close=True), game_rules.speed), False
+
+
+def _over(state: rules.State, game_rules: rules.Rules) -> np.ndarray:
+    """(B,) bool: the games that have ended or were cut off."""
+    return rules.terminated(state) | rules.truncated(state, game_rules)
 
 
 def iterations_within(milliseconds: float, cell: Cell) -> int:
