@@ -61,6 +61,8 @@ def submit(
     """
     if (policy is None) == (solver is None):
         raise ValueError("choose one of --policy and --solver")
+    if test_set == WORLDS and (policy is None or samples is not None or augment):
+        raise ValueError("the test set worlds takes greedy games: give --policy, without --samples and --augment")
     if solver is not None and seconds is None:
         raise ValueError("--solver needs --seconds, its budget for each instance")
     if seconds is not None:
@@ -111,13 +113,12 @@ def _solver(name: str, seconds: float) -> Plan:
 
 
 def _submit_games(
-    out: Path, method: str, by: str, policy: str | None, network: str | None, labels: tuple[str, ...], link: str
+    out: Path, method: str, by: str, policy: str, network: str | None, labels: tuple[str, ...], link: str
 ) -> str:
+    """Play the test set worlds with a policy, and write the decisions as a submission."""
     from dan_policy import load
     from dan_policy.games import chooser
 
-    if policy is None:
-        raise ValueError("the test set worlds needs a --policy")
     known = worlds.cells()
     for label in labels:
         if label not in known:
