@@ -54,14 +54,17 @@ def draw(
         ValueError: the instances do not fit into the memory, or the distribution or scenario cannot be drawn from.
     """
     n_nodes, n_agents = size or draw_size(rng, config)
-    world = config.world(scenario or draw_scenario(rng, config))
+    scenario = scenario or draw_scenario(rng, config)
     batch = batch if tokens is None else max(1, min(batch, tokens // n_nodes))
     check_memory(f"the number of instances with {n_nodes} nodes", batch, BYTES_PER_NODE * n_nodes)
     try:
-        arrays = sample(config.generator(), rng, batch, n_nodes, n_agents, world).arrays
+        arrays = sample(config.generator(), rng, batch, n_nodes, n_agents, config.world(scenario)).arrays
     except TypeError as error:  # a function of the user's that takes or returns something else
-        drawn = f"distribution={config.distribution!r} or scenario={config.scenario!r}"
-        raise ValueError(f"{drawn} cannot be drawn from ({error})") from error
+        given = {"distribution": config.distribution, "scenario": scenario}
+        theirs = [f"{option}={name!r}" for option, name in given.items() if ":" in name]
+        if not theirs:
+            raise
+        raise ValueError(f"{' or '.join(theirs)} cannot be drawn from ({error})") from error
     return Problem(n_agents, {name: torch.as_tensor(array, device=config.device) for name, array in arrays.items()})
 
 
