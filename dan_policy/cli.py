@@ -315,17 +315,17 @@ def _check_outputs(files: Sequence[str], outputs: Mapping[str, Sequence[Path | N
 
 def _record(instance: Instance, plan: Plan) -> dict[str, Any]:
     """The facts about a plan, in the file's units; the judge measures the lengths, not the solver."""
-    lengths = tour_lengths(instance, plan.tours) * instance.scale
-    makespan = tour_times(instance, plan.tours).max() * instance.scale  # if plain, the longest length
+    lengths, times = (judge(instance, plan.tours) * instance.scale for judge in (tour_lengths, tour_times))
     return {
         "name": instance.name,
         "n_nodes": instance.n_nodes,
         "n_agents": instance.n_agents,
         "method": plan.method,
         "seconds": plan.seconds,
-        "makespan": float(makespan),
+        "makespan": float(times.max()),
         "lower_bound": lower_bound(instance) * instance.scale,
         "lengths": lengths.tolist(),
+        "times": times.tolist(),  # if plain, the lengths
         "tours": [[int(node) for node in tour] for tour in plan.tours],
     }
 

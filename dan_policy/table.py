@@ -20,37 +20,42 @@ MOST_AT_HOME = 20  # agents without cities that have lines of their own
 def print_table(record: dict[str, Any]) -> None:
     """Print the agents and their tours, the longest in bold, then the makespan beside its lower bound.
 
-    Agents without cities are only counted if there are more than ``MOST_AT_HOME``.
+    If speeds differ or visits take time, a column has the time that each tour takes. Agents without cities are only
+    counted if there are more than ``MOST_AT_HOME``.
 
     Args:
         record: the object that ``mtsp solve --json`` prints.
     """
     console = Console(highlight=False)
-    *lengths, bound = format_lengths([*record["lengths"], record["lower_bound"]])
-    makespan, longest = record["makespan"], int(np.argmax(record["lengths"]))
+    is_timed = record["times"] != record["lengths"]
+    lengths = format_lengths(record["lengths"])
+    *times, bound = format_lengths([*record["times"], record["lower_bound"]])
+    makespan, longest = record["makespan"], int(np.argmax(record["times"]))
 
     table = Table(box=box.SIMPLE, title_justify="left", title_style="bold")
     table.title = Text(
         f"{printable(record['name']) or 'mTSP'}: {record['n_nodes'] - 1} cities, {record['n_agents']} agents"
     )
-    for heading in ("agent", "cities", "length", "share"):
+    for heading in ("agent", "cities", "length", *(["time"] if is_timed else []), "share"):
         table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("tour (0: the depot, the file's first node)", no_wrap=True)
-    width = console.width - 15 - sum(max(7, len(length)) for length in [max(lengths, key=len)] * 4)
+    table.add_column("tour (0: the depot)" if is_timed else "tour (0: the depot, the file's first node)", no_wrap=True)
+    column = max(7, *map(len, lengths))
+    width = console.width - 15 - (5 if is_timed else 4) * column
     at_home = [agent for agent, tour in enumerate(record["tours"]) if not any(tour)]
     hidden = set(at_home) if len(at_home) > MOST_AT_HOME else set()
     for agent, tour in enumerate(record["tours"]):
         if agent in hidden:
             continue
-        share = f"{record['lengths'][agent] / makespan:.0%}" if makespan else ""
+        share = f"{record['times'][agent] / makespan:.0%}" if makespan else ""
         cities = str(sum(node != 0 for node in tour))
         style = "bold" if agent == longest and makespan else None
-        table.add_row(str(agent), cities, lengths[agent], share, _elide(tour, width), style=style)
+        time = [times[agent]] if is_timed else []
+        table.add_row(str(agent), cities, lengths[agent], *time, share, _elide(tour, width), style=style)
     console.print(table)
     if hidden:
         console.print(Text(f"{len(hidden)} agents stay at home\n"))
 
-    console.print(Text(f"makespan {lengths[longest]}; {_compare(makespan, record['lower_bound'], bound)}"))
+    console.print(Text(f"makespan {times[longest]}; {_compare(makespan, record['lower_bound'], bound)}"))
     console.print(Text(f"{record['method']} in {record['seconds']:.3g} s"))
 
 

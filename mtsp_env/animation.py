@@ -43,7 +43,8 @@ def animate(
     Args:
         path: where to write it.
         instance: the problem.
-        tours: one per agent. All agents set off at time 0 and never wait. The instance must be plain.
+        tours: one per agent. All agents set off at time 0 and never wait. The instance must have neither ``appears``
+            nor ``breaks``.
         log: instead of tours, one list of (node, departed, arrived, ready) per agent, in units of time.
         seconds: how long the animation lasts, above 0; the finished tours stay for two seconds more.
         frames_per_second: at least 1.

@@ -18,8 +18,8 @@ import numpy as np
 
 from mtsp_env.instance import Instance
 from mtsp_env.picture import COLOURS, format_lengths
-from mtsp_env.schedule import end_time, make_log
-from mtsp_env.tours import Leg, Log, path_lengths
+from mtsp_env.schedule import Drive, drives, end_time, make_log, moment
+from mtsp_env.tours import Log
 from mtsp_env.writing import atomic_write
 
 
@@ -54,43 +54,45 @@ def make_page(
 
     Args:
         instance: the problem.
-        tours: one per agent. All agents set off at time 0 and never wait. The instance must be plain.
+        tours: one per agent. All agents set off at time 0 and never wait. The instance must have neither ``appears``
+            nor ``breaks``.
         log: instead of tours, one list of (node, departed, arrived, ready) per agent, in units of time.
         notes: sentences below the table.
 
     Raises:
         ValueError: not exactly one of ``tours`` and ``log``, or one that does not fit the instance.
     """
-    data = _describe(instance, make_log(instance, tours, log), share=log is None, notes=notes)
+    data = _describe(instance, make_log(instance, tours, log), are_tours=log is None, notes=notes)
     template = files("mtsp_env").joinpath("page.html").read_text(encoding="utf-8")
     encoded = json.dumps(data, allow_nan=False).replace("<", "\\u003c")  # a name may hold "</script>"
     parts = {"{{title}}": html.escape(instance.name or "mTSP"), "{{data}}": encoded}
     return re.sub(r"{{title}}|{{data}}", lambda found: parts[found[0]], template)
 
 
-def _describe(instance: Instance, log: Log, share: bool, notes: Sequence[str]) -> dict[str, Any]:
+def _describe(instance: Instance, log: Log, are_tours: bool, notes: Sequence[str]) -> dict[str, Any]:
     """What the script of the page reads. Times are in units of distance at speed 1; infinity becomes null."""
-    paths = [[0, *(leg.node for leg in legs if math.isfinite(leg.arrived))] for legs in log]
-    lengths = path_lengths(instance.nodes, paths) * instance.scale
+    lengths = moment(instance, log, math.inf).lengths * instance.scale
     end = end_time(log)
-    # Tours take as long as they are. The times of a log are those of the clock, which counts in whole ticks.
+    in_shares = are_tours and instance.world == ()
+    # Plain tours take as long as they are. The times of a log are those of the clock, which counts in whole ticks.
     last, *labels = format_lengths([end * instance.scale, *lengths.tolist()])
-    longest = float(lengths.max())
+    parts = [drives(instance, agent, legs) for agent, legs in enumerate(log)]
+    ends = [own[-1].until if own else 0.0 for own in parts]
     agents = []
-    for agent, (legs, length, label) in enumerate(zip(log, lengths.tolist(), labels, strict=True)):
-        part = f"{length / longest:.0%}" if longest else ""
+    for agent, (own, label) in enumerate(zip(parts, labels, strict=True)):
+        part = f"{ends[agent] / end:.0%}" if end else ""
         agents.append(
             {
                 "colour": COLOURS[agent % len(COLOURS)],
                 "dashed": agent >= len(COLOURS),
-                "legs": [[leg.node, *(_finite(time) for time in leg[1:])] for leg in legs],
-                "cities": sum(node != 0 for node in paths[agent]),
+                "drives": [[drive.node, drive.departed, _finite(drive.until), drive.share] for drive in own],
+                "cities": sum(drive.node != 0 and drive.share == 1.0 for drive in own),
                 "length": label,
                 "breaks": None if instance.breaks is None else _finite(float(instance.breaks[agent])),
-                "last": part if share else _home(legs, instance.scale, end),
+                "last": part if in_shares else _home(own, instance.scale, end),
             }
         )
-    ending = f"makespan {last}" if share else f"the end at {last}"
+    ending = f"makespan {last}" if are_tours else f"the end at {last}"
     return {
         "heading": f"{instance.name or 'mTSP'}: {instance.n_nodes - 1} cities, {len(log)} agents, {ending}",
         "nodes": instance.nodes.tolist(),
@@ -100,8 +102,8 @@ def _describe(instance: Instance, log: Log, share: bool, notes: Sequence[str]) -
         "decimals": len(last.partition(".")[2]),
         "end": end,
         "agents": agents,
-        "longest": int(np.argmax(lengths)) if share and longest else -1,
-        "lastColumn": "share" if share else "home at",
+        "longest": int(np.argmax(ends)) if are_tours and end else -1,
+        "lastColumn": "share" if in_shares else "home at",
         "notes": list(notes),
     }
 
@@ -110,10 +112,10 @@ def _finite(time: float) -> float | None:
     return time if math.isfinite(time) else None
 
 
-def _home(legs: Sequence[Leg], scale: float, end: float) -> str:
+def _home(own: Sequence[Drive], scale: float, end: float) -> str:
     """When an agent has come home for good; a dash if it has not."""
-    if not legs:
+    if not own:
         return format_lengths([0.0, end * scale])[0]
-    if legs[-1].node != 0 or not math.isfinite(legs[-1].arrived):
+    if own[-1].node != 0 or own[-1].share < 1.0:
         return "–"
-    return format_lengths([legs[-1].arrived * scale, end * scale])[0]
+    return format_lengths([own[-1].until * scale, end * scale])[0]

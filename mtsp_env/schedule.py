@@ -8,11 +8,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
-from mtsp_env.instance import WORLD_FIELDS, Instance
-from mtsp_env.tours import Leg, Log
+from mtsp_env.instance import Instance
+from mtsp_env.tours import TOLERANCE, Leg, Log, leg_times
+
+BARELY = 1 - 1e-9  # the largest share of the way after which an agent has not arrived
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,15 @@ class Moment:
     waits: np.ndarray
 
 
+class Drive(NamedTuple):
+    """The part of a leg that an agent drives before it arrives or breaks down."""
+
+    node: int  # to which it sets off
+    departed: float
+    until: float  # when it arrives or breaks down; inf: never, it does not move
+    share: float  # of the way that it has driven by then; 1: it arrives
+
+
 def make_log(
     instance: Instance,
     tours: Sequence[Sequence[int]] | None = None,
@@ -40,8 +53,8 @@ def make_log(
     """The checked ``log``, or that of ``tours``, whose agents all set off at time 0 and never wait.
 
     Args:
-        instance: the problem; with ``tours``, it must be plain, because a world's events decide when its tours are
-            driven.
+        instance: the problem; with ``tours``, without ``appears`` and ``breaks``, because such events decide when its
+            tours are driven.
         tours: one per agent, from the depot; a tour that does not end there is driven as far as it goes.
         log: one list of (node, departed, arrived, ready) per agent. An arrival at infinity is a leg that the agent
             never ends.
@@ -53,10 +66,9 @@ def make_log(
         raise ValueError("expected either tours or a log")
     if tours is not None:
         check_paths(instance, tours)
-        world = [name for name in WORLD_FIELDS if name in instance.arrays()]
-        if world:
-            raise ValueError(f"the instance has the world fields {world}; pass the log of a game instead of tours")
-        return [_drive(instance.nodes, tour) for tour in tours]
+        if instance.waiting_counts:
+            raise ValueError(f"the instance has the fields {list(instance.world)}; pass the log of a game, not tours")
+        return [_follow(instance, agent, tour) for agent, tour in enumerate(tours)]
     assert log is not None
     if len(log) != instance.n_agents:
         raise ValueError(f"expected {instance.n_agents} lists of legs, one per agent, got {len(log)}")
@@ -75,12 +87,16 @@ def check_paths(instance: Instance, tours: Sequence[Sequence[int]]) -> None:
             raise ValueError(f"tour {agent} visits node {outside[0]}, outside 0..{instance.n_nodes - 1}")
 
 
-def _drive(nodes: np.ndarray, tour: Sequence[int]) -> list[Leg]:
-    steps = np.linalg.norm(np.diff(nodes[list(tour)], axis=0), axis=1)
-    times = [0.0, *np.cumsum(steps).tolist()]
-    return [
-        Leg(int(node), left, there, there) for node, left, there in zip(tour[1:], times[:-1], times[1:], strict=True)
-    ]
+def _follow(instance: Instance, agent: int, tour: Sequence[int]) -> list[Leg]:
+    legs: list[Leg] = []
+    ready = 0.0
+    for here, node in pairwise(tour):
+        if here == node == 0:  # staying at the depot is no leg
+            continue
+        travel, visit = leg_times(instance, agent, len(legs), int(here), int(node))
+        legs.append(Leg(int(node), ready, ready + travel, ready + travel + visit))
+        ready = legs[-1].ready
+    return legs
 
 
 def _check_legs(instance: Instance, agent: int, legs: Sequence[Sequence[float]]) -> list[Leg]:
@@ -107,6 +123,22 @@ def end_time(log: Log) -> float:
     return max((leg.arrived for legs in log for leg in legs if math.isfinite(leg.arrived)), default=0.0)
 
 
+def drives(instance: Instance, agent: int, legs: Sequence[Leg]) -> list[Drive]:
+    """How far one agent gets on each of its legs of a checked log."""
+    breaks = math.inf if instance.breaks is None else float(instance.breaks[agent])
+    parts, here = [], 0
+    for k, leg in enumerate(legs):
+        until, share = leg.arrived, 1.0
+        travel = leg_times(instance, agent, k, here, leg.node)[0]
+        # A return leg that a breakdown cuts off ends in the log at that time, any other one at infinity.
+        if math.isinf(leg.arrived) or (leg.node == 0 and leg.departed + travel > breaks + TOLERANCE):
+            until = min(leg.arrived, breaks)
+            share = 0.0 if math.isinf(until) else min((until - leg.departed) / travel, BARELY)
+        parts.append(Drive(leg.node, leg.departed, until, share))
+        here = leg.node
+    return parts
+
+
 def moment(instance: Instance, log: Log, time: float) -> Moment:
     """Where the team of a log is at ``time``, at least 0. On its way, an agent moves at an even speed."""
     nodes = instance.nodes
@@ -114,16 +146,17 @@ def moment(instance: Instance, log: Log, time: float) -> Moment:
     paths, waits = [], np.zeros(len(log), bool)
     for agent, legs in enumerate(log):
         points, here = [nodes[0]], 0
-        for leg in legs:
-            if leg.departed > time:
+        for node, departed, until, share in drives(instance, agent, legs):
+            if departed > time:
                 waits[agent] = here == 0
                 break
-            if leg.arrived <= time:
-                points.append(nodes[leg.node])
-                owner[leg.node], here = agent, leg.node
+            if until <= time and share == 1.0:
+                points.append(nodes[node])
+                owner[node], here = agent, node
                 continue
-            share = (time - leg.departed) / (leg.arrived - leg.departed)  # 0 if it never arrives
-            points.append(points[-1] + share * (nodes[leg.node] - points[-1]))
+            if until > time:
+                share *= (time - departed) / (until - departed)  # 0 if it never arrives
+            points.append(points[-1] + share * (nodes[node] - points[-1]))
             here = -1  # on the way
         paths.append(np.array(points))
     lengths = np.array([np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in paths])

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -58,14 +59,14 @@ def test_json_is_the_judges_verdict_in_the_units_of_the_file(folder, solver, cap
     record = json.loads(printed.out)
     assert printed.err == ""
     assert list(record) == [
-        *("name", "n_nodes", "n_agents", "method", "seconds", "makespan", "lower_bound", "lengths", "tours")
+        *("name", "n_nodes", "n_agents", "method", "seconds", "makespan", "lower_bound", "lengths", "times", "tours")
     ]
     assert (record["name"], record["n_nodes"], record["n_agents"], record["method"]) == ("ten", 7, 2, "fake")
     assert record["seconds"] == 0.25
     assert record["tours"] == [[0, 1, 3, 5, 0], [0, 2, 4, 6, 0]]
     across, side, diagonal = 50**0.5, 5.0, 10 * 1.25**0.5  # half a diagonal; half a side; corner to far middle
     by_hand = [across + side + diagonal + across, side + 10.0 + across + side]
-    assert record["lengths"] == pytest.approx(by_hand)
+    assert record["lengths"] == record["times"] == pytest.approx(by_hand)
     assert record["makespan"] == pytest.approx(max(by_hand))
     assert record["lower_bound"] == pytest.approx(15.0)
     assert solver.calls == [
@@ -185,6 +186,22 @@ def test_animations_and_pages_show_what_was_printed(folder, solver, capsys) -> N
     assert f"makespan {record['makespan']:.2f}" in page
     assert "fake in 0.25 s." in page
     assert "No makespan can be below 15.00." in page
+
+
+def test_a_teams_tours_have_their_times_everywhere(folder, solver, square: Instance, capsys) -> None:
+    """Agent 1 is half as fast, so that its tour, though as long as the other, takes twice the time."""
+    write_instance("team.json", Instance(square.nodes, 2, speeds=[1.0, 0.5], name="team"))
+    assert main(["solve", "team.json", "--animate", "a.gif", "--html", "a.html", "--out", "tours.json"]) == 0
+    record = json.loads(Path("tours.json").read_text())
+    assert record["times"] == pytest.approx([record["lengths"][0], 2 * record["lengths"][1]])
+    assert record["makespan"] == max(record["times"])
+    printed = capsys.readouterr().out
+    assert re.search(r"length +time +share", printed)
+    assert f"makespan {record['makespan']:.3f};" in printed
+    assert "100%" in printed
+    page = Path("a.html").read_text()
+    assert f"makespan {record['makespan']:.3f}" in page
+    assert '"lastColumn": "home at"' in page
 
 
 def test_several_files_get_their_names_into_the_outputs(folder, solver, capsys) -> None:

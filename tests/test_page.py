@@ -44,7 +44,7 @@ def test_the_page_holds_the_tours_and_their_lengths(square: Instance, square_tou
     data = data_of(make_page(square, square_tours, notes=["One.", "Two."]))
     assert data["heading"] == "square: 6 cities, 2 agents, makespan 2.000"
     assert data["nodes"] == square.nodes.tolist()
-    assert [[leg[0] for leg in agent["legs"]] for agent in data["agents"]] == [tour[1:] for tour in square_tours]
+    assert [[drive[0] for drive in agent["drives"]] for agent in data["agents"]] == [tour[1:] for tour in square_tours]
     assert [agent["colour"] for agent in data["agents"]] == list(COLOURS[:2])
     row = {"cities": 3, "length": "2.000", "last": "100%"}
     assert all(row.items() <= agent.items() for agent in data["agents"])
@@ -62,7 +62,7 @@ def test_a_log_says_when_everybody_is_home() -> None:
     ]
     data = data_of(make_page(instance, log=log))
     assert [agent["last"] for agent in data["agents"]] == ["1,500", "–", "–", "0"]
-    assert data["agents"][1]["legs"][1] == [0, 1.0, None, None]
+    assert data["agents"][1]["drives"][1] == [0, 1.0, None, 0.0]
     assert data["heading"] == "mTSP: 2 cities, 4 agents, the end at 1,500"
     assert (data["lastColumn"], data["longest"]) == ("home at", -1)
 
@@ -114,7 +114,7 @@ def test_a_world_says_what_appears_and_who_breaks_down() -> None:
     data = data_of(make_page(CHANGING, log=CHANGING_LOG))
     assert (data["appears"], data["changes"]) == ([0.0, 0.0, 0.0, 0.2, 1.5], True)
     assert [agent["breaks"] for agent in data["agents"]] == [None, 0.35]
-    assert [(agent["cities"], agent["length"]) for agent in data["agents"]] == [(3, "1.800"), (1, "0.200")]
+    assert [(agent["cities"], agent["length"]) for agent in data["agents"]] == [(3, "1.800"), (1, "0.350")]
     plain = data_of(make_page(Instance(CHANGING.nodes, 1), [[0, 1, 2, 3, 4, 0]]))
     assert (plain["appears"], plain["changes"], plain["agents"][0]["breaks"]) == (None, False, None)
 
@@ -227,10 +227,10 @@ def test_play_runs_to_the_end(shown: Any) -> None:
     ("time", "states", "known", "coloured", "discs", "is_grey"),
     [
         (0.0, ["", ""], 2, 0, [[782, 782], [782, 782]], False),
-        (0.25, ["waits", ""], 3, 2, [[782, 782], [406, 782]], False),  # agent 1 never arrives
-        (0.4, ["", "broken"], 3, 2, [[688, 782], [406, 782]], True),
-        (1.2, ["waits", "broken"], 3, 3, [[782, 782], [406, 782]], True),
-        (2.3, ["", "broken"], 4, 4, [[782, 782], [406, 782]], True),
+        (0.25, ["waits", ""], 3, 2, [[782, 782], [312, 782]], False),  # agent 1 never arrives
+        (0.4, ["", "broken"], 3, 2, [[688, 782], [124, 782]], True),
+        (1.2, ["waits", "broken"], 3, 3, [[782, 782], [124, 782]], True),
+        (2.3, ["", "broken"], 4, 4, [[782, 782], [124, 782]], True),
     ],
 )
 def test_worlds_change_with_the_slider(browser, tmp_path, time, states, known, coloured, discs, is_grey) -> None:

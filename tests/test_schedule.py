@@ -14,6 +14,7 @@ from mtsp_env import Instance, mtsp_v0, tour_lengths, uniform
 from mtsp_env.distributions import SCENARIOS
 from mtsp_env.render import make_page
 from mtsp_env.schedule import end_time, make_log, moment
+from mtsp_env.tours import tour_times
 
 
 def test_the_square_by_hand(square: Instance, square_tours: list[list[int]]) -> None:
@@ -42,7 +43,8 @@ def test_without_waiting_everybody_has_driven_as_long_as_the_time_or_its_tour(se
     assert now.lengths == pytest.approx(np.minimum(lengths, time))
     last = moment(instance, log, end_time(log) + 1e-9)
     for agent, tour in enumerate(tours):
-        assert last.paths[agent].tolist() == instance.nodes[tour].tolist()
+        driven = tour if len(tour) > 2 else [0]  # staying at the depot is no leg
+        assert last.paths[agent].tolist() == instance.nodes[driven].tolist()
         assert (last.owner[tour[1:-1]] == agent).all()
 
 
@@ -93,11 +95,34 @@ def test_what_does_not_fit_is_refused(square: Instance, tours, log, message: str
         make_log(square, tours, log)
 
 
-def test_tours_do_not_say_when_a_world_is_driven(square: Instance, square_tours: list[list[int]]) -> None:
-    world = Instance(square.nodes, 2, speeds=[1.0, 2.0])
-    with pytest.raises(ValueError, match=r"world fields \['speeds'\]; pass the log of a game"):
+def test_tours_of_a_team_take_as_long_as_the_judge_says(square: Instance, square_tours: list[list[int]]) -> None:
+    traffic = np.array([[1.0, 2.0], [1.5, 1.0]])
+    world = Instance(square.nodes, 2, speeds=[1.0, 2.0], service=[0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0], traffic=traffic)
+    log = make_log(world, square_tours)
+    assert log[0][:2] == [(2, 0.0, 0.5, 2.5), (1, 2.5, 3.5, 4.5)]
+    assert [legs[-1].ready for legs in log] == pytest.approx(tour_times(world, square_tours).tolist(), abs=1e-12)
+    assert moment(world, log, 3.0).paths[0].tolist() == [[0.5, 0.5], [0.5, 1.0], [0.25, 1.0]]
+
+
+@pytest.mark.parametrize(("field", "values"), [("appears", [0.0] * 6 + [1.0]), ("breaks", [1.0, math.inf])])
+def test_tours_do_not_say_when_a_world_with_events_is_driven(square: Instance, square_tours, field, values) -> None:
+    world = Instance(square.nodes, 2, **{field: values})
+    with pytest.raises(ValueError, match=rf"the fields \['{field}'\]; pass the log of a game"):
         make_log(world, square_tours)
     assert make_log(world, log=[[(1, 0.0, 1.0, 1.0)], []])
+
+
+def test_an_agent_that_breaks_down_stops_on_its_way(square: Instance) -> None:
+    """Agents 0 and 1 break down at 0.75, halfway home, which the log ends then, and halfway to a second city."""
+    world = Instance(square.nodes, 3, breaks=[0.75, 0.75, math.inf])
+    first, second = [(2, 0.0, 0.5, 0.5), (0, 0.5, 0.75, 0.75)], [(4, 0.0, 0.5, 0.5), (5, 0.5, math.inf, math.inf)]
+    log = make_log(world, log=[first, second, []])
+    for time, driven in ((0.625, 0.125), (0.75, 0.25), (9.0, 0.25)):
+        now = moment(world, log, time)
+        assert now.paths[0][-1].tolist() == [0.5, 1.0 - driven]
+        assert now.paths[1][-1].tolist() == [0.5 + driven, 0.0]
+        assert now.owner.tolist() == [-1, -1, 0, -1, 1, -1, -1]
+    assert now.lengths.tolist() == [0.75, 0.75, 0.0]
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
