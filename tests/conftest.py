@@ -12,8 +12,10 @@ from hypothesis import HealthCheck, settings
 
 from mtsp_env import Instance, write_instance
 
-if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # a shell has started the tests in the background
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # as in the foreground: some tests send the signal
+# Some tests send signals that are ignored if a shell (SIGINT) or nohup (SIGHUP) has started them in the background.
+for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+    if signal.getsignal(number) == signal.SIG_IGN:
+        signal.signal(number, handler)
 
 # For `make fuzz`. Tests in tests/fuzz say nothing about max_examples, so that a profile decides: by default 100.
 settings.register_profile("fuzz", max_examples=10_000, deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -79,23 +79,17 @@ def test_two_processes_have_the_gradient_of_one_with_all_their_episodes(tmp_path
 
 
 @pytest.mark.slow
-def test_training_under_torchrun_keeps_the_processes_alike_and_resumes(tmp_path):
-    torchrun(*SMALL, "--out", tmp_path, "--steps", 2)
-    torchrun(*SMALL, "--out", tmp_path, "--steps", 3, "--resume")
-    one, other = (checkpoint.read(tmp_path / name) for name in ("checkpoint.pt", "checkpoint-1.pt"))
-    assert one["progress"]["step"] == other["progress"]["step"] == 3
-    assert one["progress"]["instances"] == 3 * 4 * 2
-    for name, value in one["network"].items():
-        assert torch.equal(value, other["network"][name])
-    assert one["random"]["numpy"] != other["random"]["numpy"]  # each draws its own instances
-    assert not torch.equal(one["baseline"]["test_costs"], other["baseline"]["test_costs"])
-
-
-@pytest.mark.slow
-def test_a_damaged_checkpoint_sends_all_processes_back_to_the_one_before(tmp_path):
+def test_processes_stay_alike_and_a_damaged_checkpoint_sends_all_of_them_back_to_the_one_before(tmp_path):
     """The continuation ends as a run would have ended whose files stayed whole."""
     every_step = [*SMALL, "--checkpoint-every", 1]
     torchrun(*every_step, "--steps", 4, "--out", tmp_path / "whole")
+    one, other = (checkpoint.read(tmp_path / "whole" / name) for name in ("checkpoint.pt", "checkpoint-1.pt"))
+    assert one["progress"]["step"] == other["progress"]["step"] == 4
+    assert one["progress"]["instances"] == 4 * 4 * 2
+    assert same(one["network"], other["network"])
+    assert one["random"]["numpy"] != other["random"]["numpy"]  # each draws its own instances
+    assert not torch.equal(one["baseline"]["test_costs"], other["baseline"]["test_costs"])
+
     torchrun(*every_step, "--steps", 3, "--out", tmp_path / "damaged")
     path = tmp_path / "damaged" / "checkpoint-1.pt"
     data = bytearray(path.read_bytes())

@@ -279,7 +279,7 @@ def test_what_does_not_fit_into_the_memory_is_refused(option):
 def test_the_command_line_imitates(tmp_path, capsys):
     small = ["--n-nodes", "6", "7", "--n-agents", "1", "2", "--nodes-per-agent", "2", "--set-tokens", "100",
              "--buffer", "4", "--network.embed-dim", "16", "--validation-instances", "4", "--out", str(tmp_path),
-             "--no-tensorboard", "--teacher-iterations", "5"]  # fmt: skip
+             "--no-tensorboard", "--teacher-iterations", "5", "--workers", "0"]  # fmt: skip
     assert main(["imitate", "--steps", "2", *small]) == 0
     assert main(["imitate", "--steps", "2", *small]) == 2
     assert "add --resume" in capsys.readouterr().err

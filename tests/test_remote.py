@@ -93,7 +93,7 @@ def test_more_workers_than_cpus_are_refused(network, cluster):
         RayWorkers(network, replace(CONFIG, ray_workers=3), first_step=0)
 
 
-def test_without_ray_the_error_names_the_extra(network, monkeypatch):
+def test_without_ray_the_error_names_the_group(network, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(ModuleNotFoundError, match=r"mtsp-env\[ray\]"):
+    with pytest.raises(ModuleNotFoundError, match="pip install --group ray"):
         RayWorkers(network, CONFIG, first_step=0)

@@ -13,6 +13,7 @@ from tiny import TINY, interrupt_after
 
 from benchmarks.policies.attention_model import AttentionModel
 from dan_policy import load
+from dan_policy.registry import load_extra
 from train import checkpoint
 from train.__main__ import main
 from train.checkpoint import check_same_run
@@ -142,6 +143,16 @@ def test_logs_and_weights_are_written(tmp_path):
     assert list(tmp_path.glob("tensorboard/events*"))
     continued = ReinforceLearner(replace(TINY, init=str(tmp_path / "last.safetensors")))
     assert same(dict(continued.network.state_dict()), dict(learner.network.state_dict()))
+
+
+def test_a_run_that_ends_before_its_first_validation_has_best_weights_too(tmp_path):
+    reinforce(replace(TINY, out=tmp_path, steps=1, validate_every=2))
+    first = (tmp_path / "best.safetensors").read_bytes()
+    assert same(*(dict(load(tmp_path / f"{name}.safetensors").state_dict()) for name in ("best", "last")))
+    learner = reinforce(replace(TINY, out=tmp_path, steps=3, validate_every=2, resume=True))
+    assert (tmp_path / "best.safetensors").read_bytes() != first  # those that were validated take their place
+    assert load_extra(tmp_path / "best.safetensors")["step"] == 2
+    assert learner.best < np.inf
 
 
 def test_a_custom_network_is_trained_saved_and_continued(tmp_path):

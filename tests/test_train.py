@@ -254,10 +254,10 @@ def test_the_policy_is_the_running_average_of_the_weights(tmp_path):
 
 @pytest.mark.slow
 def test_training_lowers_the_greedy_cost_on_held_out_instances(tmp_path):
-    """200 steps at n = 10, m = 2."""
+    """80 steps at n = 10, m = 2."""
     config = replace(
-        TINY, out=tmp_path, n_nodes=(10, 10), n_agents=(2, 2), batch_size=64, steps=200, seed=1,
-        learning_rate=1e-3, decay_every=1000,
+        TINY, out=tmp_path, n_nodes=(10, 10), n_agents=(2, 2), batch_size=64, steps=80, seed=1,
+        learning_rate=2e-3, decay_every=1000,
         network=DANConfig(embed_dim=64, feedforward_dim=128, n_heads=4, city_layers=1, prune_visited=True),
         challenge_every=20, challenge_instances=128, validate_every=1000, checkpoint_every=1000,
     )  # fmt: skip
@@ -265,7 +265,7 @@ def test_training_lowers_the_greedy_cost_on_held_out_instances(tmp_path):
     before = costs(ReinforceLearner(config).network, held_out, config)
     after = costs(reinforce(config).network, held_out, config)
     assert better(after, before, 1e-6)
-    assert after.mean() < 0.65 * before.mean()  # 0.57; the nearest city: 0.60
+    assert after.mean() < 0.65 * before.mean()  # 0.59; the nearest city: 0.60
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ import copy
 from typing import Any, Protocol
 
 import numpy as np
-from scipy.stats import ttest_rel
 from torch import Tensor, nn
 
 from mtsp_env.instance import Problem
@@ -107,4 +106,6 @@ def better(cost: Tensor, than: Tensor, p: float) -> bool:
         return False
     if np.ptp(difference) == 0:
         return True  # lower by the same amount everywhere: certain, and the test would divide by 0
+    from scipy.stats import ttest_rel  # slow to import, and runs without challenges do not need it
+
     return bool(ttest_rel(cost.cpu().numpy(), than.cpu().numpy(), alternative="less").pvalue < p)

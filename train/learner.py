@@ -109,7 +109,10 @@ class Learner(ABC):
         save_weights(self.config.out / name, self.averaged_network, self.config, history)
 
     def save(self) -> None:
-        """Write a checkpoint, and the current weights to ``last.safetensors``."""
+        """Write a checkpoint, and the current weights to ``last.safetensors``.
+
+        Until the first validation they are also the best ones: a run that ends before it has ``best.safetensors``.
+        """
         progress = {name: getattr(self, name) for name in PROGRESS}
         state = {
             "config": self.config.to_dict(),
@@ -121,6 +124,8 @@ class Learner(ABC):
         checkpoint.write(checkpoint_path(self.config), state | self.state_dict())
         if rank() == 0:
             self.save_weights("last.safetensors")
+            if math.isinf(self.best):
+                self.save_weights("best.safetensors")
 
     def restore(self) -> None:
         """Continue from the checkpoint in ``config.out``.

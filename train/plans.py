@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.optimize import linear_sum_assignment
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn import functional
@@ -114,6 +113,8 @@ def match_plans(
     rows = (starting.sum(1) > 1).nonzero()[:, 0]
     if len(rows) == 0:
         return decisions
+    from scipy.optimize import linear_sum_assignment  # slow to import, and other labels do not need it
+
     cost = _costs_of_tours(logits, decisions, next_weight, assignment_weight)[rows].cpu().numpy()
     takes = np.tile(np.arange(deciding.shape[1]), (len(decisions), 1))  # (N, m): whose tour each agent takes
     for row, agents, matrix in zip(rows.tolist(), starting[rows].cpu().numpy(), cost, strict=True):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch.optim.lr_scheduler import ChainedScheduler, LinearLR, StepLR
@@ -19,7 +19,9 @@ from train.loop import run, run_folder
 from train.loss import EpisodicReinforceLoss, backward, decisions_with_advantage, subsample
 from train.presets import Preset
 from train.reinforce_config import ReinforceConfig
-from train.remote import RayWorkers
+
+if TYPE_CHECKING:
+    from train.remote import RayWorkers
 
 
 class ReinforceLearner(Learner):
@@ -71,6 +73,8 @@ class ReinforceLearner(Learner):
         """Fresh instances and the network's episodes on them, played in this process or by Ray workers."""
         config = self.config
         if config.collector == "ray":
+            from train.remote import RayWorkers  # slow to import
+
             self.workers = self.workers or RayWorkers(self.network, config, self.step)
             return self.workers.collect()
         drawn = draw(self.rng, config.at(self.step), config.batch_size, config.batch_tokens)

@@ -43,7 +43,7 @@ class RayWorkers:
         try:
             import ray
         except ModuleNotFoundError as error:
-            raise ModuleNotFoundError('--collector ray needs Ray: pip install "mtsp-env[ray]"', name="ray") from error
+            raise ModuleNotFoundError("--collector ray needs Ray: pip install --group ray", name="ray") from error
         self.config, self.keys, self.started = config, observation_keys(network), not ray.is_initialized()
         if self.started:
             ray.init()  # the cluster that RAY_ADDRESS names, otherwise this machine
