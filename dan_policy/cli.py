@@ -315,7 +315,8 @@ def _check_outputs(files: Sequence[str], outputs: Mapping[str, Sequence[Path | N
 
 def _record(instance: Instance, plan: Plan) -> dict[str, Any]:
     """The facts about a plan, in the file's units; the judge measures the lengths, not the solver."""
-    lengths, times = (judge(instance, plan.tours) * instance.scale for judge in (tour_lengths, tour_times))
+    lengths = tour_lengths(instance, plan.tours) * instance.scale
+    times = tour_times(instance, plan.tours) * instance.scale
     return {
         "name": instance.name,
         "n_nodes": instance.n_nodes,

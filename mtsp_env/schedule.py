@@ -129,11 +129,12 @@ def drives(instance: Instance, agent: int, legs: Sequence[Leg]) -> list[Drive]:
     parts, here = [], 0
     for k, leg in enumerate(legs):
         until, share = leg.arrived, 1.0
-        travel = leg_times(instance, agent, k, here, leg.node)[0]
-        # A return leg that a breakdown cuts off ends in the log at that time, any other one at infinity.
-        if math.isinf(leg.arrived) or (leg.node == 0 and leg.departed + travel > breaks + TOLERANCE):
-            until = min(leg.arrived, breaks)
-            share = 0.0 if math.isinf(until) else min((until - leg.departed) / travel, BARELY)
+        # Of legs that a breakdown cuts off, those for a city arrive at infinity, those for the depot at the breakdown.
+        if until >= breaks and (leg.node == 0 or math.isinf(until)):
+            travel, until = leg_times(instance, agent, k, here, leg.node)[0], breaks
+            if math.isinf(leg.arrived) or leg.departed + travel > breaks + TOLERANCE:
+                driven = max(breaks - leg.departed, 0.0)
+                share = min(driven / travel, BARELY) if travel > 0.0 and math.isfinite(breaks) else 0.0
         parts.append(Drive(leg.node, leg.departed, until, share))
         here = leg.node
     return parts

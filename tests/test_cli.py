@@ -202,6 +202,7 @@ def test_a_teams_tours_have_their_times_everywhere(folder, solver, square: Insta
     page = Path("a.html").read_text()
     assert f"makespan {record['makespan']:.3f}" in page
     assert '"lastColumn": "home at"' in page
+    assert '"longest": 1' in page
 
 
 def test_several_files_get_their_names_into_the_outputs(folder, solver, capsys) -> None:

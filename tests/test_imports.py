@@ -98,6 +98,14 @@ def test_arrows_point_down(file: str) -> None:
     assert not wrong
 
 
+@pytest.mark.parametrize("file", [file for file in FILES if file.startswith("train/")])
+def test_training_starts_without_what_few_runs_need(file: str) -> None:
+    """SciPy and TorchRL's collectors are slow to import."""
+    slow = [name for name, at_import in imports_of(file) if at_import and fnmatch(name, "scipy*")]
+    slow += [name for name, at_import in imports_of(file) if at_import and name == "train.remote"]
+    assert not slow
+
+
 def cycles(graph: dict[str, set[str]]) -> list[list[str]]:
     """The strongly connected components of more than one module."""
     order: list[str] = []

@@ -113,7 +113,7 @@ def test_tours_do_not_say_when_a_world_with_events_is_driven(square: Instance, s
 
 
 def test_an_agent_that_breaks_down_stops_on_its_way(square: Instance) -> None:
-    """Agents 0 and 1 break down at 0.75, halfway home, which the log ends then, and halfway to a second city."""
+    """Agents 0 and 1 break down at 0.75, halfway on legs of 0.5: agent 0 on its way home, agent 1 to a second city."""
     world = Instance(square.nodes, 3, breaks=[0.75, 0.75, math.inf])
     first, second = [(2, 0.0, 0.5, 0.5), (0, 0.5, 0.75, 0.75)], [(4, 0.0, 0.5, 0.5), (5, 0.5, math.inf, math.inf)]
     log = make_log(world, log=[first, second, []])
@@ -123,6 +123,15 @@ def test_an_agent_that_breaks_down_stops_on_its_way(square: Instance) -> None:
         assert now.paths[1][-1].tolist() == [0.5 + driven, 0.0]
         assert now.owner.tolist() == [-1, -1, 0, -1, 1, -1, -1]
     assert now.lengths.tolist() == [0.75, 0.75, 0.0]
+
+
+def test_an_agent_that_breaks_down_before_it_moves_stays_where_it_is() -> None:
+    """Agent 0 leaves for a city at the depot's own place, agent 1 only after its breakdown."""
+    world = Instance([[0.0, 0.0], [0.0, 0.0], [1.0, 0.0]], 3, breaks=[0.5, 0.5, math.inf])
+    log = make_log(world, log=[[(1, 0.0, math.inf, math.inf)], [(2, 0.75, math.inf, math.inf)], []])
+    now = moment(world, log, 9.0)
+    assert [path[-1].tolist() for path in now.paths] == [[0.0, 0.0]] * 3
+    assert now.owner.tolist() == [-1, -1, -1]
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)

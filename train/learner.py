@@ -111,7 +111,7 @@ class Learner(ABC):
     def save(self) -> None:
         """Write a checkpoint, and the current weights to ``last.safetensors``.
 
-        Until the first validation they are also the best ones: a run that ends before it has ``best.safetensors``.
+        Until the first validation, ``best.safetensors`` gets them as well, so that every run has this file.
         """
         progress = {name: getattr(self, name) for name in PROGRESS}
         state = {
