@@ -82,28 +82,28 @@ def test_two_processes_have_the_gradient_of_one_with_all_their_episodes(tmp_path
 def test_processes_stay_alike_and_a_damaged_checkpoint_sends_all_of_them_back_to_the_one_before(tmp_path):
     """The continuation ends as a run would have ended whose files stayed whole."""
     every_step = [*SMALL, "--checkpoint-every", 1]
-    torchrun(*every_step, "--steps", 4, "--out", tmp_path / "whole")
-    one, other = (checkpoint.read(tmp_path / "whole" / name) for name in ("checkpoint.pt", "checkpoint-1.pt"))
+    run = tmp_path / "run"
+    torchrun(*every_step, "--steps", 4, "--out", run)
+    one, other = (checkpoint.read(run / name) for name in ("checkpoint.pt", "checkpoint-1.pt"))
     assert one["progress"]["step"] == other["progress"]["step"] == 4
     assert one["progress"]["instances"] == 4 * 4 * 2
     assert same(one["network"], other["network"])
     assert one["random"]["numpy"] != other["random"]["numpy"]  # each draws its own instances
     assert not torch.equal(one["baseline"]["test_costs"], other["baseline"]["test_costs"])
 
-    torchrun(*every_step, "--steps", 3, "--out", tmp_path / "damaged")
-    path = tmp_path / "damaged" / "checkpoint-1.pt"
+    path = run / "checkpoint-1.pt"
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
-    errors = torchrun(*every_step, "--steps", 4, "--resume", "--out", tmp_path / "damaged")
-    assert f"{path} is left out, step 2 is continued ({path}: not a checkpoint, or a damaged one" in errors
-    assert f"{path.with_name('checkpoint.pt')} is left out, step 2 is continued (another process" in errors
-    for name in ("checkpoint.pt", "checkpoint-1.pt"):
-        whole, again = (checkpoint.read(tmp_path / run / name) for run in ("whole", "damaged"))
+    errors = torchrun(*every_step, "--steps", 4, "--resume", "--out", run)
+    assert f"{path} is left out, step 3 is continued ({path}: not a checkpoint, or a damaged one" in errors
+    assert f"{path.with_name('checkpoint.pt')} is left out, step 3 is continued (another process" in errors
+    for whole, name in ((one, "checkpoint.pt"), (other, "checkpoint-1.pt")):
+        again = checkpoint.read(run / name)
         assert again["progress"]["step"] == 4
         for part in ("network", "average", "optimiser", "schedule", "baseline", "random"):
             assert same(whole[part], again[part]), (name, part)
-    steps = np.loadtxt(tmp_path / "damaged" / "logs" / "scalars" / "cost.csv", delimiter=",")[:, 0]
+    steps = np.loadtxt(run / "logs" / "scalars" / "cost.csv", delimiter=",")[:, 0]
     assert steps.tolist() == [1, 2, 3, 4]
 
 

@@ -29,14 +29,9 @@ def fences(page: Path, language: str) -> list[tuple[str, str]]:
     return [(note, code) for block_language, note, code in blocks if block_language == language]
 
 
-def python_examples() -> list:
+def python_examples(page: Path) -> list[str]:
     """Every Python block to run; blocks that the reader is asked to save as files are left out."""
-    return [
-        pytest.param(page, code, id=f"{page.stem}-{number}")
-        for page in PAGES
-        for number, (note, code) in enumerate(fences(page, "python"))
-        if not note
-    ]
+    return [code for note, code in fences(page, "python") if not note]
 
 
 def folder_of(page: Path, folder: Path) -> Path:
@@ -94,12 +89,19 @@ def help_of(program: tuple[str, ...]) -> str:
     return output.getvalue()
 
 
-@pytest.mark.parametrize(("page", "example"), python_examples())
+@pytest.mark.parametrize("page", [page for page in PAGES if python_examples(page)], ids=lambda page: page.stem)
 @pytest.mark.slow
-def test_examples_run(page: Path, example: str, tmp_path: Path) -> None:
-    result = run([sys.executable, "-W", "ignore", "-c", example], folder_of(page, tmp_path))
+def test_examples_run(page: Path, tmp_path: Path) -> None:
+    """Each block by itself, with no names from those before it, but in one process: most of them import torch."""
+    code = f"""
+for number, example in enumerate({python_examples(page)!r}):
+    print("<", number, ">", sep="", flush=True)
+    exec(compile(example, "block %d" % number, "exec"), {{"__name__": "__main__"}})
+"""
+    result = run([sys.executable, "-W", "ignore", "-c", code], folder_of(page, tmp_path))
     assert result.returncode == 0, result.stderr
-    assert result.stdout.strip()
+    printed = re.split(r"^<\d+>$", result.stdout, flags=re.MULTILINE)[1:]
+    assert len(printed) == len(python_examples(page)) and all(map(str.strip, printed)), result.stdout
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -234,9 +234,9 @@ def test_a_run_cannot_be_resumed_with_another_student(tmp_path, student):
 
 @pytest.mark.slow
 def test_imitation_learns_what_the_teacher_does(tmp_path):
-    """150 steps at n = 10, m = 2 lower the greedy cost on held-out instances."""
+    """80 steps at n = 10, m = 2 lower the greedy cost on held-out instances."""
     config = replace(
-        TINY, out=tmp_path, n_nodes=(10, 10), n_agents=(2, 2), set_tokens=2000, sets_per_step=3, steps=150, average=0.9,
+        TINY, out=tmp_path, n_nodes=(10, 10), n_agents=(2, 2), set_tokens=2000, sets_per_step=3, steps=80, average=0.9,
         learning_rate=3e-3, warmup=10, validate_every=1000, checkpoint_every=1000,
         network=DANConfig(embed_dim=32, feedforward_dim=64, n_heads=4, city_layers=1, prune_visited=True),
     )  # fmt: skip
@@ -246,7 +246,7 @@ def test_imitation_learns_what_the_teacher_does(tmp_path):
     learner = imitate(config)
     after = costs(learner.averaged_network, held_out, config)
     assert better(after, before, 1e-6)
-    assert after.mean() < 0.85 * before.mean()  # 0.76
+    assert after.mean() < 0.85 * before.mean()  # 0.79
     reward = play(learner.averaged_network, held_out[0], config, "greedy").reward
     assert torch.equal(-reward, after)
 

@@ -56,17 +56,20 @@ def check_solves_europe(file: Path) -> None:
 
 
 @pytest.mark.slow
-def test_it_is_trained_validated_and_solves(folder):
+def test_it_is_trained_validated_and_solves(folder, capsys):
     pytest.importorskip("numba", reason="the teacher is compiled with Numba")
     size = "--n-nodes 8 10 --n-agents 2 2 --nodes-per-agent 2"
-    run(
-        f"python -m train imitate --policy mynet:make --policy-options layers 1 embed_dim 16 {size} --steps 3 "
+    options = (
+        f"--policy mynet:make --policy-options layers 1 embed_dim 16 {size} --steps 3 "
         "--set-tokens 100 --buffer 4 --workers 0 --teacher-iterations 5 --warmup 1 --average 0 --validate-every 3 "
         "--validation-instances 8 --out runs/mynet --no-tensorboard"
     )
+    assert main(["imitate", *options.split()]) == 0
     file = Path("runs/mynet/best.safetensors")
     assert load_config(file) == {"layers": 1, "embed_dim": 16}
-    printed = run(f"python -m train validate {file} --network mynet:make {size} --instances 8")
+    capsys.readouterr()
+    assert main(["validate", str(file), "--network", "mynet:make", *size.split(), "--instances", "8"]) == 0
+    printed = capsys.readouterr().out
     (cost,) = validate((str(file),), "mynet:make", (8, 10), (2, 2), 2, 8)
     assert float(printed.split()[0]) == pytest.approx(cost, abs=1e-4)
     check_solves_europe(file)
@@ -104,14 +107,14 @@ def test_leading_dimensions_are_free_and_the_actor_reads_its_keys(folder):
 
 @pytest.mark.slow
 def test_the_commands_of_the_page_work(folder):
-    """The page's own lines, but with a quarter of its minute of training."""
+    """The page's own lines, but with some seconds instead of a minute of training, and fewer games."""
     shell = PAGE.split("## Train, validate and solve")[1].partition("```sh\n")[2].partition("```")[0]
     train, check, plan = shell.replace("\\\n", " ").splitlines()
+    check += " --instances 32"
     assert "--seconds 60" in train
-    run(train.replace("--seconds 60", "--seconds 15"))
+    run(train.replace("--seconds 60", "--seconds 8"))
     torch.manual_seed(0)  # the run's first weights
     save("initial.safetensors", build("mynet:make"), "mynet:make")
     trained, initial = (float(run(line).split()[0]) for line in (check, check.replace("runs/mynet/last", "initial")))
     assert trained < initial  # about 3.2 against 10.3; how many steps a minute has depends on the machine
     assert "makespan" in run(plan)
-    check_solves_europe(Path("runs/mynet/last.safetensors"))
