@@ -38,6 +38,7 @@ DAN_TESTS = [
     "tests/test_heuristics.py",
     "tests/test_mtsp_v0.py",
     "tests/test_planning.py",
+    "tests/test_planning_policies.py",
     "tests/test_registry.py",
     "tests/test_rules.py",
     "tests/test_shipped.py",
