@@ -94,6 +94,7 @@ def test_policies_plan_no_worlds_that_change(field: str) -> None:
         solve(world)
 
 
+@pytest.mark.slow
 def test_policies_plan_for_teams_that_differ_and_visits_that_take_time() -> None:
     """The makespan is that of the same greedy game in the batched environment; improving never makes it worse."""
     env = BatchedMTSP(12, 3, [4], scenario=team_and_service, depot="final", seed=1)

@@ -203,6 +203,7 @@ def test_the_command_takes_better_tours_and_verifies(tmp_path, monkeypatch, caps
         *("joint-greedy", "joint-greedy-x8", "joint-s64", "schedulenet-greedy", "schedulenet-s64"),
     ],
 )
+@pytest.mark.slow
 def test_our_solvers_solve_tiny_instances_and_repeat_themselves(name):
     for instance in [*CELL.instances(0), *Cell(3, 5, 1).instances(0)]:
         tours = solvers.find(name)(instance, 0.05, 0)

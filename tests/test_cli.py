@@ -178,6 +178,7 @@ def test_files_hold_what_was_printed(folder, solver, capsys) -> None:
     assert Path("tours.svg").read_bytes().startswith(b"<?xml")
 
 
+@pytest.mark.slow
 def test_animations_and_pages_show_what_was_printed(folder, solver, capsys) -> None:
     assert main(["solve", "ten.tsp", "--agents", "2", "--json", "--animate", "a.gif", "--html", "a.html"]) == 0
     record = json.loads(capsys.readouterr().out)
@@ -188,6 +189,7 @@ def test_animations_and_pages_show_what_was_printed(folder, solver, capsys) -> N
     assert "No makespan can be below 15.00." in page
 
 
+@pytest.mark.slow
 def test_a_teams_tours_have_their_times_everywhere(folder, solver, square: Instance, capsys) -> None:
     """Agent 1 is half as fast, so that its tour, though as long as the other, takes twice the time."""
     write_instance("team.json", Instance(square.nodes, 2, speeds=[1.0, 0.5], name="team"))

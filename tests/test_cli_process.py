@@ -19,6 +19,7 @@ EUROPE = Path(__file__).parent.parent / "examples" / "europe.tsp"
 TORCH = ("torch", "tensordict", "torchrl")
 
 
+@pytest.mark.slow
 def test_only_solving_imports_what_is_heavy(tmp_path) -> None:
     missing, file = (*TORCH, "matplotlib", "numba", "rich", "vrplib"), str(tmp_path / "a.json")
     made = run("generate", "--nodes", "5", "--agents", "2", file, missing=missing)
@@ -37,6 +38,7 @@ def test_without_tyro_the_command_names_the_extra() -> None:
     assert 'pip install "mtsp-env[dan]"' in done.stderr and done.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_help_needs_nothing_heavy() -> None:
     for argv in (["--help"], ["solve", "--help"], ["generate", "--help"]):
         done = run(*argv, missing=(*TORCH, "matplotlib", "numba", "rich", "vrplib", "scipy"))

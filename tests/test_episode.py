@@ -50,6 +50,7 @@ def aec_tours(instance, choose):
     return env.tours
 
 
+@pytest.mark.slow
 def test_rollout_agrees_with_the_pettingzoo_environment(network):
     """The same network, greedily, agent by agent in the AEC loop."""
 

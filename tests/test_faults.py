@@ -158,6 +158,7 @@ WRITERS = {
 
 
 @pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.slow
 def test_a_full_disk_leaves_the_old_file(tmp_path, name):
     if name.endswith(".mp4"):
         pytest.importorskip("imageio_ffmpeg", reason="needs the extra video")
@@ -196,6 +197,7 @@ def test_a_full_disk_loses_only_the_rows_of_the_log_that_did_not_fit(tmp_path):
     assert file.read_text().splitlines() == [f"{number},{1 / number}" for number in range(1, step)]
 
 
+@pytest.mark.slow
 def test_training_on_a_full_disk_ends_with_one_line_and_can_be_resumed(tmp_path, capsys):
     small = ["--n-nodes", "5", "6", "--batch-size", "4", "--network.embed-dim", "16", "--challenge-instances", "4",
              "--validation-instances", "4", "--no-tensorboard", "--checkpoint-every", "1"]  # fmt: skip

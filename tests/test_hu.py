@@ -175,6 +175,7 @@ def test_it_plans_tours_like_any_policy(instance, network):
 
 
 @pytest.mark.parametrize("name", ["hu-greedy", "hu-s64"])
+@pytest.mark.slow
 def test_the_shipped_weights_solve_the_teams_they_were_trained_for(name):
     pytest.importorskip("ortools")
     for m in (5, 10):

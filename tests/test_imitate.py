@@ -87,6 +87,7 @@ def test_tours_run_counter_clockwise_and_agents_are_sorted_by_angle():
     assert canonical(nodes, tours) == [south_west, south_east, north_east, north_west]
 
 
+@pytest.mark.slow
 @given(solved())
 @settings(max_examples=50, deadline=None)
 def test_the_teachers_policy_plays_its_tours(case):
@@ -144,6 +145,7 @@ def student(tmp_path):
     return replace(TINY, roll_in=str(tmp_path / "student.safetensors"))
 
 
+@pytest.mark.slow
 def test_the_student_plays_the_beginning_and_the_teacher_continues(student):
     begins = set()
     for index in range(12):
@@ -163,6 +165,7 @@ def test_the_student_plays_the_beginning_and_the_teacher_continues(student):
     assert len(begins) > 3
 
 
+@pytest.mark.slow
 def test_decisions_after_the_students_part_are_learnt_from(student):
     for passes in (1.0, 0.25):
         buffer = Buffer(replace(student, passes=passes, sets_per_step=1, buffer=1), KEYS, np.random.default_rng(0))

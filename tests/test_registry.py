@@ -230,6 +230,7 @@ def test_absurd_configurations_are_refused_before_anything_is_built(tmp_path, na
                 load(tmp_path / "a")
 
 
+@pytest.mark.slow
 def test_wide_networks_take_no_memory_before_the_tensors_are_compared(tmp_path, file):
     """10^12 parameters would take 4 TB."""
     config = {"embed_dim": 16_384, "feedforward_dim": 16_384, "city_layers": 1000, "n_heads": 1}

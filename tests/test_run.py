@@ -116,6 +116,7 @@ def test_a_hanging_warm_up_is_killed_too(tmp_path):
 
 
 @pytest.mark.parametrize("signal_number", [signal.SIGKILL, signal.SIGINT])
+@pytest.mark.slow
 def test_a_killed_run_loses_only_the_running_row(tmp_path, signal_number):
     out = tmp_path / "rows.jsonl"
     command = [sys.executable, "-m", "benchmarks", "run", "--table", "smoke", "--out", str(out)]

@@ -135,6 +135,7 @@ def test_what_a_killed_run_left_is_removed(tmp_path):
     assert not list(tmp_path.glob(".*.tmp"))
 
 
+@pytest.mark.slow
 def test_logs_and_weights_are_written(tmp_path):
     learner = reinforce(replace(TINY, out=tmp_path, tensorboard=True))
     cost = np.loadtxt(tmp_path / "logs/scalars/cost.csv", delimiter=",")

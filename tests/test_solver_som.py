@@ -22,6 +22,7 @@ def ring_lengths(rings: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("guided", [False, True])
+@pytest.mark.slow
 def test_tiny_instances_are_solved_in_time_and_reproducibly(guided):
     som._compile()
     for instance in Cell(8, 2, 3).instances(0):

@@ -27,6 +27,7 @@ def test_samples_differ_less_with_a_larger_clip() -> None:
     assert solve(instance, decode="sample", samples=2, clip=1e-3).makespan > 1.5 * greedy.makespan
 
 
+@pytest.mark.slow
 def test_the_table_compares_with_the_c_in_use(tmp_path, capsys) -> None:
     out = tmp_path / "clip.md"
     assert main(["sweep-clip", "--sizes", "8x2", "60x4", "--instances", "2", "--samples", "3", "--out", str(out)]) == 0
