@@ -67,6 +67,8 @@ class RayWorkers:
                     "remote_configs": needs,
                 },
             )
+            # The first exchange of weights waits a minute for the workers, but importing torch may take them longer
+            ray.get([worker.stats.remote() for worker in self.workers.remote_collectors])
         except BaseException:
             if self.started:
                 ray.shutdown()
