@@ -17,7 +17,7 @@ test: $(VENV)/.dev
 	$(PYTEST)
 
 # The same, but lists the lines of mtsp_env and dan_policy that no test runs, and fails if more than 5 % are missed. Counting
-# lines takes about as long as the tests of the rules; COVERAGE_CORE=sysmon makes it nearly free from Python 3.12 on.
+# lines makes the tests of the rules take almost twice as long; from Python 3.12 on, COVERAGE_CORE=sysmon should make it cheaper.
 coverage: $(VENV)/.dev
 	$(PYTEST) --cov --cov-report=term
 

@@ -62,10 +62,10 @@ def test_a_signal_during_a_challenge_saves_the_step(number, tmp_path):
     assert checkpoint.read(tmp_path / "checkpoint.pt")["progress"]["step"] == steps(tmp_path)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])  # SIGTERM: test_distributed
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.slow
 def test_a_signal_to_the_whole_process_group_reaches_the_label_workers_too_and_the_run_is_saved(number, tmp_path):
-    """Ctrl-C in a terminal and a terminal that is closed send such signals.
+    """Ctrl-C in a terminal, a job scheduler that ends a job, and a terminal that is closed send such signals.
 
     The buffer holds one set and its workers make one at a time, so that the run needs labels to finish its step.
     """
@@ -97,7 +97,7 @@ def test_label_workers_end_with_their_killed_parent(tmp_path):
     process = train(*IMITATE, "--steps", 100000, "--workers", 1, "--out", tmp_path)
     wait_until(lambda: steps(tmp_path) >= 1)
     started = children(process.pid)
-    assert started
+    assert any("spawn_main" in " ".join(psutil.Process(pid).cmdline()) for pid in started)
     process.kill()
     process.communicate()
     wait_until(lambda: not any(map(alive, started)))
