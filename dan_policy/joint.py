@@ -4,6 +4,10 @@ In DAN, the agents' embeddings do not depend on the cities, and cities do not at
 attended to the agents. Here all tokens attend to each other in every layer, at the same cost.
 The policy stays decentralised: one agent's observation in, logits of that agent's next node out.
 
+A transformer that is given coordinates has to learn what is near. With ``JointConfig.distances``, each head adds a
+learned multiple of the distance between two tokens to its attention scores, as ALiBi does along a text (Press et al.
+2022) and ICAM for routing (Zhou et al. 2024), and so do the pointers.
+
 In worlds it can read further keys (``JointConfig.reads``). Each adds a learned vector to some tokens, times how far the
 value is from its neutral one. The vectors begin as zero, so that weights without them go on as they are; a key that an
 observation does not have counts as neutral.
@@ -48,8 +52,8 @@ class JointConfig:
 
     Raises:
         ValueError: a size below 1 or beyond ``layers.GREATEST``, a number of heads that does not divide the width, a
-            clip that is not above 0 or beyond ``layers.GREATEST_CLIP``, a view below 1, or keys to read that are
-            unknown or named twice.
+            clip that is not above 0 or beyond ``layers.GREATEST_CLIP``, a view below 1, distances that are not
+            a bool, or keys to read that are unknown or named twice.
     """
 
     embed_dim: int = 128  # d
@@ -58,6 +62,7 @@ class JointConfig:
     n_layers: int = 5
     tanh_clip: float = 10.0  # C: logits lie in [-C, C]
     view: int | None = None  # see at most this many cities, the nearest unvisited ones; None: all of them
+    distances: bool = False  # attention scores and logits depend on the distances between tokens
     reads: tuple[str, ...] = ()  # keys of observations in worlds that it reads as well, of READABLE
 
     def __post_init__(self) -> None:
@@ -67,6 +72,8 @@ class JointConfig:
         check_clip(self.tanh_clip)
         if self.view is not None and not (type(self.view) is int and self.view >= 1):
             raise ValueError(f"view must be None or at least 1 city, got {self.view!r}")
+        if type(self.distances) is not bool:
+            raise ValueError(f"distances must be True or False, got {self.distances!r}")
         keys = list(self.reads) if isinstance(self.reads, (list, tuple)) else [self.reads]
         if not all(key in READABLE for key in map(str, keys)) or len(set(keys)) < len(keys):
             raise ValueError(f"reads must be different keys of {list(READABLE)}, got {self.reads!r}")
@@ -97,6 +104,11 @@ class JointDAN(nn.Module):
         self.next_key = nn.Linear(d, d, bias=False)
         self.assignment_query = nn.Linear(d, d, bias=False)
         self.assignment_key = nn.Linear(d, d, bias=False)
+        if config.distances:  # from one head that sees everything alike to one that sees little but its neighbours
+            slopes = -3.0 * torch.linspace(0.0, 1.0, config.n_heads).square()
+            self.distance_slopes = nn.Parameter(slopes.repeat(config.n_layers, 1))  # (layers, heads)
+            self.next_slope = nn.Parameter(torch.tensor(-0.1))
+            self.assignment_slope = nn.Parameter(torch.tensor(-0.5))
         self.effect = nn.ParameterDict({key: torch.zeros(d) for key in config.reads})  # of each key, see the module
 
     def forward(self, cities: Tensor, agents: Tensor, visited: Tensor, agent: Tensor, *extra: Tensor | None) -> Tensor:
@@ -115,9 +127,10 @@ class JointDAN(nn.Module):
         """
         lead, n = visited.shape[:-1], visited.shape[-1]
         cities, agents, visited, agent = _rows(cities, agents, visited, agent)
-        h_agents, h_nodes, in_view = self._encode(cities, agents, visited, agent, extra)
+        h_agents, h_nodes, in_view, distances = self._encode(cities, agents, visited, agent, extra)
         h_decider = _gather(h_agents, agent[:, None])  # (B, 1, d)
-        logits = self._next(h_decider, h_nodes)  # (B, 1, k)
+        distances = None if distances is None else _gather(distances, agent[:, None])  # (B, 1, k)
+        logits = self._next(h_decider, h_nodes, distances)  # (B, 1, k)
         return scatter_nodes(logits, in_view, visited, -self.config.tanh_clip).reshape(*lead, n)
 
     def forward_dense(
@@ -130,9 +143,11 @@ class JointDAN(nn.Module):
         """
         lead, m, n = visited.shape[:-1], agents.shape[-2], visited.shape[-1]
         cities, agents, visited, agent = _rows(cities, agents, visited, agent)
-        h_agents, h_nodes, in_view = self._encode(cities, agents, visited, agent, extra)
-        next_logits = self._next(h_agents, h_nodes)  # (B, m, k)
+        h_agents, h_nodes, in_view, distances = self._encode(cities, agents, visited, agent, extra)
+        next_logits = self._next(h_agents, h_nodes, distances)  # (B, m, k)
         assignment = pointer_logits(self.assignment_query(h_agents), self.assignment_key(h_nodes))  # (B, m, k)
+        if distances is not None:
+            assignment = assignment + self.assignment_slope * distances
         next_logits = scatter_nodes(next_logits, in_view, visited, -self.config.tanh_clip)  # (B, m, n)
         assignment = scatter_nodes(assignment, in_view, visited, 0.0)  # (B, m, n)
         policy = _gather(next_logits, agent[:, None])  # (B, 1, n)
@@ -140,8 +155,9 @@ class JointDAN(nn.Module):
 
     def _encode(
         self, cities: Tensor, agents: Tensor, visited: Tensor, agent: Tensor, extra: Sequence[Tensor | None] = ()
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Embeddings of the agents (B, m, d) and of the nodes in view (B, k, d), and those nodes' indices (B, k)."""
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+        """Embeddings of the agents (B, m, d) and of the nodes in view (B, k, d), those nodes' indices (B, k), and the
+        distances from agents to nodes (B, m, k); None if the network does not use them."""
         m = agents.shape[1]
         in_view, real = open_nodes(cities, visited, self.config.view, other_tokens=m)  # (B, k), the depot first
         seen = _gather(cities, in_view)  # (B, k, 2)
@@ -152,10 +168,12 @@ class JointDAN(nn.Module):
             if values is not None:
                 h = h + self._effect(key, values.reshape(len(h), -1), in_view, m)
         mask = None if real is None else torch.cat([torch.ones_like(decides), real], dim=1)  # (B, m + k)
-        for layer in self.layers:
-            h = layer(h, h, mask)
+        distances = token_distances(agents, seen, (~visited).sum(1)) if self.config.distances else None
+        for index, layer in enumerate(self.layers):
+            bias = None if distances is None else distances[:, None] * self.distance_slopes[index, :, None, None]
+            h = layer(h, h, mask, bias)  # (B, m + k, d)
         h = self.norm(h)
-        return h[:, :m], h[:, m:], in_view
+        return h[:, :m], h[:, m:], in_view, None if distances is None else distances[:, :m, m:]
 
     def _effect(self, key: str, values: Tensor, in_view: Tensor, m: int) -> Tensor:
         """What ``values`` (B, m) or (B, n) of ``key`` add to the tokens of m agents and k nodes: (B, m + k, d)."""
@@ -169,9 +187,36 @@ class JointDAN(nn.Module):
             added[:, m] = amount.mean(1)  # the depot's token
         return added[:, :, None] * self.effect[key]
 
-    def _next(self, h_agents: Tensor, h_nodes: Tensor) -> Tensor:
-        """(B, m, d), (B, k, d) -> (B, m, k) logits in [-C, C]."""
-        return self.config.tanh_clip * torch.tanh(pointer_logits(self.next_query(h_agents), self.next_key(h_nodes)))
+    def _next(self, h_agents: Tensor, h_nodes: Tensor, distances: Tensor | None) -> Tensor:
+        """(B, m, d), (B, k, d) and (B, m, k) -> (B, m, k) logits in [-C, C]."""
+        u = pointer_logits(self.next_query(h_agents), self.next_key(h_nodes))
+        if distances is not None:
+            u = u + self.next_slope * distances
+        return self.config.tanh_clip * torch.tanh(u)
+
+
+def token_distances(agents: Tensor, nodes: Tensor, n_open: Tensor) -> Tensor:
+    """Distances between agents' destinations and nodes, in multiples of the typical distance between neighbours.
+
+    An agent has its remaining travel time still to go, so that this counts as well: from an agent to a node, it is how
+    long the agent takes to get there if it goes there next.
+
+    Args:
+        agents: (B, m, 3), destinations and remaining travel times.
+        nodes: (B, k, 2).
+        n_open: (B,), number of unvisited nodes. n points in the unit square lie about 1 / sqrt(n) apart.
+
+    Returns:
+        (B, m + k, m + k), symmetric, 0 on the diagonal.
+    """
+    m = agents.shape[1]
+    points = torch.cat([agents[:, :, :2], nodes], dim=1)
+    between = torch.linalg.vector_norm(points[:, :, None] - points[:, None], dim=-1)
+    remaining = agents[:, :, 2]
+    between[:, :m] += remaining[:, :, None]
+    between[:, :, :m] += remaining[:, None]
+    between.diagonal(dim1=1, dim2=2).zero_()
+    return between * n_open.to(between.dtype).sqrt()[:, None, None]
 
 
 def _rows(cities: Tensor, agents: Tensor, visited: Tensor, agent: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -67,35 +67,46 @@ class AttentionLayer(nn.Module):
         self.norm_attention = nn.LayerNorm(embed_dim)
         self.norm_feedforward = nn.LayerNorm(embed_dim)
 
-    def forward(self, query: Tensor, source: Tensor, mask: Tensor | None = None) -> Tensor:
-        """query (B, q, d), source (B, k, d), mask (B, k) bool: True at the keys to attend to -> (B, q, d)."""
+    def forward(self, query: Tensor, source: Tensor, mask: Tensor | None = None, bias: Tensor | None = None) -> Tensor:
+        """Embeddings (B, q, d) of the queries.
+
+        Args:
+            query: (B, q, d).
+            source: (B, k, d).
+            mask: (B, k) bool, True at the keys to attend to; None: all of them.
+            bias: (B, heads, q, k), added to the attention scores.
+        """
         if self.norm == "post":
-            h = self.norm_attention(query + self._attend(query, source, mask))
+            h = self.norm_attention(query + self._attend(query, source, mask, bias))
             return self.norm_feedforward(h + self.feedforward(h))
         normed = self.norm_attention(query)
-        h = query + self._attend(normed, normed if source is query else self.norm_attention(source), mask)
+        h = query + self._attend(normed, normed if source is query else self.norm_attention(source), mask, bias)
         return h + self.feedforward(self.norm_feedforward(h))
 
-    def _attend(self, query: Tensor, source: Tensor, mask: Tensor | None) -> Tensor:
+    def _attend(self, query: Tensor, source: Tensor, mask: Tensor | None, bias: Tensor | None) -> Tensor:
         q = self._heads(self.query(query))  # (B, heads, q, d / heads)
         k, v = (self._heads(h) for h in self.key_value(source).chunk(2, dim=-1))
-        h = attention(q, k, v, None if mask is None else mask[:, None, None, :])
+        h = attention(q, k, v, None if mask is None else mask[:, None, None, :], bias)
         return self.out(h.transpose(1, 2).flatten(2))
 
     def _heads(self, h: Tensor) -> Tensor:
         return h.unflatten(-1, (self.n_heads, -1)).transpose(1, 2)
 
 
-def attention(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Tensor:
-    """softmax(q k' / sqrt(width)) v for q, k, v of shape (B, heads, length, width).
+def attention(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None, bias: Tensor | None = None) -> Tensor:
+    """softmax(q k' / sqrt(width) + bias) v for q, k, v of shape (B, heads, length, width).
 
-    ``mask`` is bool, broadcasts to (B, heads, q, k), and is True at the keys to attend to.
+    ``mask`` is bool, True at the keys to attend to, and ``bias`` float. Both broadcast to (B, heads, q, k).
     """
+    bias = None if bias is None else bias.to(q.dtype)
     if q.requires_grad and q.dtype == torch.bfloat16 and q.device.type == "cpu":
         # On CPUs the fused kernel's backward pass in bfloat16 takes five times as long as these products
         u = (q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)
+        u = u if bias is None else u + bias
         u = u if mask is None else u.masked_fill(~mask, -torch.inf)
         return torch.softmax(u, dim=-1) @ v
+    if bias is not None:
+        mask = bias if mask is None else bias.masked_fill(~mask, -torch.inf)
     return F.scaled_dot_product_attention(q, k, v, mask)
 
 

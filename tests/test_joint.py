@@ -6,10 +6,15 @@ import pytest
 import torch
 
 from dan_policy import layers
-from dan_policy.joint import JointConfig, JointDAN
+from dan_policy.joint import JointConfig, JointDAN, token_distances
 
 SMALL = JointConfig(embed_dim=16, feedforward_dim=32, n_heads=2, n_layers=2)
-CONFIGS = {"small": SMALL, "default": JointConfig(), "short-sighted": replace(SMALL, view=3)}
+CONFIGS = {
+    "small": SMALL,
+    "default": JointConfig(),
+    "short-sighted": replace(SMALL, view=3),
+    "distances": replace(SMALL, distances=True),
+}
 
 
 @pytest.fixture(params=CONFIGS)
@@ -18,10 +23,10 @@ def network(request):
     return JointDAN(CONFIGS[request.param]).eval()
 
 
-@pytest.fixture
-def small():
+@pytest.fixture(params=["small", "distances"])
+def small(request):
     torch.manual_seed(0)
-    return JointDAN(SMALL).eval()
+    return JointDAN(CONFIGS[request.param]).eval()
 
 
 def observation(batch=5, n=9, m=4, seed=0, dtype=torch.float32):
@@ -108,9 +113,9 @@ def test_pruning_equals_removing_the_visited_cities(small):
 
 
 def test_a_view_holds_the_nearest_unvisited_cities(small):
-    """As if the others were not there; those get the least logit, so that they stay legal."""
+    """It does not matter where the others are; those get the least logit, so that they stay legal."""
     cities, agents, visited, agent = observation(n=30)
-    small.config = replace(SMALL, view=6)
+    small.config = replace(small.config, view=6)
     logits = small(cities, agents, visited, agent)
     dense = small.forward_dense(cities, agents, visited, agent)
     for row in range(len(cities)):
@@ -118,9 +123,13 @@ def test_a_view_holds_the_nearest_unvisited_cities(small):
         distance[0] = -1.0
         seen = distance.argsort()[:7].sort().values  # the depot and six cities
         one = slice(row, row + 1)
-        alone = small(cities[one, seen], agents[one], visited[one, seen], agent[one])
-        assert torch.allclose(logits[one, seen], alone, atol=1e-5)
         hidden = [node for node in range(30) if node not in seen]
+        elsewhere = cities[one].clone()
+        elsewhere[:, hidden] += 10.0
+        assert torch.allclose(small(elsewhere, agents[one], visited[one], agent[one]), logits[one], atol=1e-5)
+        if not small.config.distances:  # with distances, the number of unvisited cities is their scale
+            alone = small(cities[one, seen], agents[one], visited[one, seen], agent[one])
+            assert torch.allclose(logits[one, seen], alone, atol=1e-5)
         assert (logits[row, hidden] == -SMALL.tanh_clip).all()
         assert (dense.next[row, :, hidden] == -SMALL.tanh_clip).all()
         assert (dense.assignment[row, :, hidden] == 0.0).all()
@@ -128,7 +137,7 @@ def test_a_view_holds_the_nearest_unvisited_cities(small):
 
 def test_a_view_of_all_cities_hides_none(small):
     seen = small(*observation())
-    small.config = replace(SMALL, view=8)
+    small.config = replace(small.config, view=8)
     assert torch.equal(small(*observation()), seen)
 
 
@@ -151,6 +160,29 @@ def test_float32_agrees_with_float64(network):
     assert torch.allclose(single.double(), double, atol=1e-4)
 
 
+def test_distances_of_a_case_solved_by_hand():
+    """Two agents, two nodes. The second agent has half a unit still to go to where the second node is."""
+    agents = torch.tensor([[[0.0, 0.0, 0.0], [0.3, 0.4, 0.5]]])
+    nodes = torch.tensor([[[0.0, 1.0], [0.3, 0.4]]])
+    distances = token_distances(agents, nodes, torch.tensor([4]))
+    far = (0.3**2 + 0.6**2) ** 0.5
+    expected = 2 * torch.tensor([[0, 1, 1, 0.5], [1, 0, far + 0.5, 0.5], [1, far + 0.5, 0, far], [0.5, 0.5, far, 0]])
+    assert torch.allclose(distances[0], expected)
+
+
+def test_without_slopes_distances_have_no_effect():
+    torch.manual_seed(0)
+    plain, network = JointDAN(SMALL), JointDAN(replace(SMALL, distances=True))
+    network.load_state_dict(network.state_dict() | plain.state_dict())
+    assert not torch.allclose(network(*observation()), plain(*observation()), atol=1e-3)
+    slopes = [parameter for name, parameter in network.named_parameters() if "slope" in name]
+    assert len(slopes) == 3
+    for parameter in slopes:
+        torch.nn.init.zeros_(parameter)
+    for ours, theirs in zip(network.forward_dense(*observation()), plain.forward_dense(*observation()), strict=True):
+        assert torch.allclose(ours, theirs, atol=1e-5)
+
+
 def test_logits_stay_within_the_clip(network):
     cities, agents, visited, agent = observation()
     assert network(cities * 100, agents * 100, visited, agent).abs().max() <= network.config.tanh_clip
@@ -164,7 +196,7 @@ def test_dense_gradients_reach_every_parameter_and_the_policys_all_but_the_assig
     network.zero_grad()
     network(*observation()).square().sum().backward()
     unused = {name for name, parameter in network.named_parameters() if parameter.grad is None}
-    assert unused == {"assignment_query.weight", "assignment_key.weight"}
+    assert unused - {"assignment_slope"} == {"assignment_query.weight", "assignment_key.weight"}
 
 
 def test_the_default_has_about_a_million_parameters():
@@ -178,6 +210,7 @@ def test_the_default_has_about_a_million_parameters():
         ({"n_layers": 0}, "n_layers must be a whole number from 1 to 1000, got 0"),
         ({"tanh_clip": 0.0}, r"tanh_clip must be a number above 0 and at most 1e\+06, got 0.0"),
         ({"view": 0}, "view must be None or at least 1 city, got 0"),
+        ({"distances": 1}, "distances must be True or False, got 1"),
         ({"reads": ("moon",)}, r"reads must be different keys of \['agent_speeds', .*\], got \('moon',\)"),
         ({"reads": ("service", "service")}, r"reads must be different keys"),
     ],

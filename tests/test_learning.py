@@ -13,6 +13,8 @@ from benchmarks import best_known
 from benchmarks.policies import nearest
 from benchmarks.studies import ablations, curves
 from benchmarks.suite import SEED, Cell
+from train import checkpoint
+from train.learner import checkpoint_path
 from train.presets import QUICK, REFINE
 from train.supervised_config import ImitateConfig
 
@@ -68,10 +70,12 @@ def test_a_variant_is_trained_in_its_stages(small, tmp_path, variant, stages):
 @pytest.mark.slow
 def test_dense_labels_are_those_of_the_variant(small, tmp_path):
     weighted = ablations.Variant("w", 1.0, {"n_layers": 1}, "joint", next_weight=0.5, assignment_weight=1.0)
-    plain = ablations.Variant("p", 1.0, {"n_layers": 1}, "joint")
+    plain = ablations.Variant("p", 1.0, {"n_layers": 1, "distances": True}, "joint", optimiser="muon")
     for variant, labelled in ((weighted, True), (plain, False)):
         result = ablations.train_and_evaluate(variant, 1.0, 0, tmp_path / variant.name)
         assert result["imitation_steps"] > 0
+        state = checkpoint.read(checkpoint_path(ImitateConfig(out=tmp_path / variant.name / "imitation")))
+        assert ("muon" in state["optimiser"]) is (variant.optimiser == "muon")
         for name in ("next_loss", "assignment_loss"):
             with next((tmp_path / variant.name).rglob(f"{name}.csv")).open() as file:
                 losses = [float(row[1]) for row in csv.reader(file)]

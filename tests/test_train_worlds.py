@@ -13,6 +13,7 @@ from dan_policy import make_actor
 from dan_policy.joint import READABLE, JointConfig, JointDAN
 from dan_policy.registry import load, save
 from mtsp_env import SCENARIOS
+from mtsp_env.batched import BatchedMTSP
 from mtsp_env.instance import Problem
 from train import checkpoint
 from train.collect import draw, draw_scenario, draw_set, environment, play, repeat
@@ -124,3 +125,17 @@ def test_weights_start_to_read_with_no_effect(tmp_path):
     assert load(tmp_path / "reading.safetensors").config.reads == ("service", "agent_speeds")
     with pytest.raises(ValueError, match="reads must be None: the policy 'dan' has no such option"):
         make_network(replace(config, policy="dan", init="default", reads=("service",)))
+
+
+def test_weights_start_to_use_distances_with_no_effect(tmp_path):
+    torch.manual_seed(6)
+    save(tmp_path / "plain.safetensors", JointDAN(JOINT))
+    config = replace(WORLD, init=str(tmp_path / "plain.safetensors"))
+    network, plain = make_network(replace(config, distances=True)), make_network(config)
+    assert network.config == replace(plain.config, distances=True)
+    assert network.distance_slopes.shape == (1, 2) and not network.distance_slopes.any()
+    observation = BatchedMTSP(12, 3, [8], seed=0).reset()
+    keys = [observation.get(key, None) for key in network.in_keys]
+    assert torch.allclose(network(*keys), plain(*keys), atol=1e-5)
+    save(tmp_path / "distances.safetensors", network)
+    assert load(tmp_path / "distances.safetensors").config.distances

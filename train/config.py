@@ -70,6 +70,9 @@ class RunConfig:
     reads: tuple[str, ...] | None = None
     """With `init`: override which extra keys of observations in worlds the network reads. New ones have no effect
     before they are learnt."""
+    distances: bool | None = None
+    """With `init`: override whether the attention and the logits of the joint network depend on distances. They have no
+    effect before they are learnt."""
     max_grad_norm: float = 1.0
     """Gradients are scaled down to this norm if theirs is larger."""
     average: float = 0.0
@@ -124,7 +127,7 @@ class RunConfig:
             raise ValueError(f"policy must be package.module:factory or one of {sorted(NETWORKS)}, got {self.policy!r}")
         if self.registered and self.policy_options:
             raise ValueError(f"policy_options must be empty for the policy {self.policy!r}, got {self.policy_options}")
-        for name in ("prune_visited", "reads"):
+        for name in ("prune_visited", "reads", "distances"):
             value = getattr(self, name)
             if value is not None and (self.init is None or not self.registered):
                 raise ValueError(f"{name} must be None unless a registered policy starts from init, got {value}")

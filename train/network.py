@@ -84,8 +84,8 @@ def observation_keys(network: nn.Module) -> tuple[Key, ...]:
 
 
 def _changed(network: nn.Module, config: RunConfig) -> nn.Module:
-    """The same weights in a network with the ``prune_visited`` and ``reads`` of the run, if it gives them."""
-    given = {"prune_visited": config.prune_visited, "reads": config.reads}
+    """The same weights in a network with what the run overrides, if anything. Parameters that it adds begin as zero."""
+    given = {"prune_visited": config.prune_visited, "reads": config.reads, "distances": config.distances}
     changes = {name: value for name, value in given.items() if value is not None}
     if not changes:
         return network
@@ -93,5 +93,6 @@ def _changed(network: nn.Module, config: RunConfig) -> nn.Module:
     for name in changes.keys() - options.keys():
         raise ValueError(f"{name} must be None: the policy {config.policy!r} has no such option")
     changed = build(config.policy, options | changes)
-    changed.load_state_dict(changed.state_dict() | network.state_dict())
+    added = {name: torch.zeros_like(tensor) for name, tensor in changed.state_dict().items()}
+    changed.load_state_dict(added | network.state_dict())
     return changed.eval()

@@ -33,6 +33,7 @@ from train import checkpoint
 from train.config import RunConfig
 from train.imitate import imitate
 from train.learner import checkpoint_path
+from train.optimisers import OptimiserName
 from train.presets import REFINE
 from train.reinforce import reinforce
 from train.supervised_config import ImitateConfig
@@ -54,6 +55,7 @@ class Variant:
         policy: the network, as ``RunConfig.policy`` takes it.
         next_weight: weight of the other agents' next nodes in the loss of imitation.
         assignment_weight: weight of each city's visitor in the loss of imitation.
+        optimiser: the optimiser of imitation.
     """
 
     name: str
@@ -62,6 +64,7 @@ class Variant:
     policy: str = "dan"
     next_weight: float = 0.0
     assignment_weight: float = 0.0
+    optimiser: OptimiserName = "adamw"
 
 
 DAN_VARIANTS = (
@@ -85,11 +88,26 @@ DENSE_LABELS = (
     Variant("joint, both", imitation=1.0, policy="joint", next_weight=0.5, assignment_weight=1.0),
 )
 
-Study = Literal["dan", "dense-labels"]
-STUDIES: dict[Study, tuple[Variant, ...]] = {"dan": DAN_VARIANTS, "dense-labels": DENSE_LABELS}
+_JOINT = Variant("joint", imitation=1.0, policy="joint", next_weight=0.5, assignment_weight=1.0)
+
+JOINT_VARIANTS = (
+    _JOINT,
+    replace(_JOINT, name="joint, distances", network={"distances": True}),
+    replace(_JOINT, name="joint, Muon", optimiser="muon"),
+    replace(_JOINT, name="joint, distances, Muon", network={"distances": True}, optimiser="muon"),
+)
+
+Study = Literal["dan", "dense-labels", "joint"]
+STUDIES: dict[Study, tuple[Variant, ...]] = {
+    "dan": DAN_VARIANTS,
+    "dense-labels": DENSE_LABELS,
+    "joint": JOINT_VARIANTS,
+}
 NOTES: dict[Study, str] = {
     "dan": "70 % imitation and 30 % REINFORCE, unless its name says otherwise",
     "dense-labels": "imitation alone. The labels are the next node of the deciding agent and what the name says",
+    "joint": "imitation alone. The labels are the next node of every agent and the agent of every city; the optimiser "
+    "is AdamW unless the name says otherwise",
 }
 
 
@@ -106,7 +124,8 @@ def main(
 
     Args:
         study: "dan" for parts of DAN and of its training, "dense-labels" for networks and what they are taught: the
-            next node of the deciding agent alone, that of every agent, the agent of every city, or both.
+            next node of the deciding agent alone, that of every agent, the agent of every city, or both; "joint" for
+            distances in the joint network, and its optimiser.
         minutes: training time of each variant and seed on one thread, the labelling of its instances included.
         seeds: seeds of the training; every variant is trained once with each. The instances that variants are compared
             on are never trained on.
@@ -177,6 +196,7 @@ def train_and_evaluate(variant: Variant, seconds: float, seed: int, folder: Path
             anneal_seconds=time,
             next_weight=variant.next_weight,
             assignment_weight=variant.assignment_weight,
+            optimiser=variant.optimiser,
             **common,
         )
         run = imitate(continued(config, time))
