@@ -1,7 +1,7 @@
 """The problem, described once: the fields of an instance, and batches of instances of one size.
 
 ``FIELDS`` describes every array of a problem: dtype, shape, unit, range. Validation, equality, hashing, pickling, JSON,
-batches and the TorchRL specs are derived from it, so that a new field is one entry here, its lines in ``rules.py`` and
+batches and the TorchRL specs are derived from it, so that a new field is one entry here, its lines in ``world.py`` and
 its check in ``tours.py``.
 
 Coordinates lie in the unit square, as in the paper (Sec. 6: "uniformly at random in the unit square"); ``scale`` turns
@@ -41,6 +41,7 @@ class ArrayField:
         high: greatest value; infinity is allowed only if this is ``math.inf``.
         zero_at_depot: whether entry 0 must be 0.
         check: a further check of the array ``(..., *shape)``; returns what is wrong, or None.
+        usual: of a world field, the value with which agents move as in a plain game.
         needs: the world field without which a game does not have this array; None: every game has it.
     """
 
@@ -52,6 +53,7 @@ class ArrayField:
     high: float | None = None
     zero_at_depot: bool = False
     check: Callable[[np.ndarray], str | None] | None = None
+    usual: float | None = None
     needs: str | None = None
 
     def sizes(self, n_nodes: int, n_agents: int) -> tuple[int | None, ...]:
@@ -97,16 +99,25 @@ class Instance:
     n_agents: int  # type: ignore[misc]  # mypy takes the call above for a default value
     name: str = ""
     scale: float = 1.0
-    speeds: np.ndarray | None = _array_field(None, ("m",), "speed relative to 1", 0.0, False)
-    service: np.ndarray | None = _array_field(None, ("n",), "time that a visit takes", 0.0, zero_at_depot=True)
+    speeds: np.ndarray | None = _array_field(None, ("m",), "speed relative to 1", 0.0, False, usual=1.0)
+    service: np.ndarray | None = _array_field(
+        None, ("n",), "time that a visit takes", 0.0, zero_at_depot=True, usual=0.0
+    )
     appears: np.ndarray | None = _array_field(
-        None, ("n",), "time at which a node becomes known to everybody", 0.0, zero_at_depot=True
+        None, ("n",), "time at which a node becomes known to everybody", 0.0, zero_at_depot=True, usual=0.0
     )
     breaks: np.ndarray | None = _array_field(
-        None, ("m",), "time at which an agent stops for good", 0.0, False, math.inf, check=_someone_keeps_going
+        None,
+        ("m",),
+        "time at which an agent stops for good",
+        0.0,
+        False,
+        math.inf,
+        check=_someone_keeps_going,
+        usual=math.inf,
     )
     traffic: np.ndarray | None = _array_field(
-        None, ("m", "K"), "factor on the travel time of an agent's k-th leg, k modulo K", 0.0, False
+        None, ("m", "K"), "factor on the travel time of an agent's k-th leg, k modulo K", 0.0, False, usual=1.0
     )
 
     def __post_init__(self) -> None:

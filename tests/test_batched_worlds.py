@@ -12,9 +12,9 @@ from torchrl.envs.utils import check_env_specs, step_mdp
 
 from dan_policy import load, rollout, solve
 from mtsp_env import SCENARIOS, Instance, lower_bound, rules
-from mtsp_env.batched import BatchedMTSP
+from mtsp_env.batched import BatchedMTSP, random_legal_action
 from mtsp_env.distributions import sample, service, team
-from mtsp_env.instance import Problem
+from mtsp_env.instance import FIELDS, WORLD_FIELDS, Problem
 
 OPTIONS = [{}, {"view": 3, "hearing": 0.4}]
 in_every_scenario = pytest.mark.parametrize("scenario", SCENARIOS)
@@ -64,6 +64,26 @@ def test_partial_resets_leave_other_rows_bit_identical(scenario: str) -> None:
     assert same(after[~reset], before[~reset].exclude("_reset"))
     assert (after["game", "decisions"][reset] == 0).all()
     assert not torch.equal(after["game", "nodes"][reset], before["game", "nodes"][reset])
+
+
+@pytest.mark.parametrize("name", WORLD_FIELDS)
+def test_agents_move_as_in_a_plain_game_if_a_field_has_its_usual_value(name: str) -> None:
+    """They go home only if no city is left: in some worlds, waiting at the depot takes time that counts."""
+
+    def usual(rng: np.random.Generator, batch: int, n_nodes: int, n_agents: int) -> dict[str, np.ndarray]:
+        sizes = [2 if size is None else size for size in FIELDS[name].sizes(n_nodes, n_agents)]
+        return {name: np.full((batch, *sizes), FIELDS[name].usual)}
+
+    plain, world = (make(scenario, depot="wait") for scenario in ("plain", usual))
+    td, other = plain.reset(), world.reset()
+    while not td["done"].all():
+        assert torch.equal(td["action_mask"], other["action_mask"])
+        mask = td["action_mask"].clone()
+        mask[:, 0] &= ~mask[:, 1:].any(1)
+        action = random_legal_action(mask)
+        td, other = (env.step(at.set("action", action))["next"] for env, at in ((plain, td), (world, other)))
+    assert torch.equal(td["game", "visits"], other["game", "visits"])
+    assert torch.allclose(plain.makespan(), world.makespan(), rtol=1e-12)
 
 
 @in_every_scenario

@@ -36,6 +36,7 @@ FORBIDDEN = {
     "mtsp_env/reference/solver.py": [*FACES, "mtsp_env.render", "mtsp_env.rules"],
     "mtsp_env/render.py": [*FACES, "mtsp_env.reference"],
     "dan_policy/dan.py": ["mtsp_env*"],
+    "dan_policy/joint.py": ["mtsp_env*"],
     "dan_policy/layers.py": ["mtsp_env*"],
     "dan_policy/actor.py": ["mtsp_env*"],
     "benchmarks/peers/rl4co_speed.py": ["mtsp_env*", "dan_policy*", "train*", "benchmarks*"],

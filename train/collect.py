@@ -14,7 +14,7 @@ from dan_policy.episode import Decode, Episode, rollout
 from dan_policy.symmetry import views
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.distributions import sample
-from mtsp_env.instance import Problem
+from mtsp_env.instance import FIELDS, Problem
 from mtsp_env.machine import check_memory
 from mtsp_env.rules import Depot
 from train.config import RunConfig
@@ -154,8 +154,7 @@ def _environment(
 ) -> BatchedMTSP:
     def uneventful(rng: np.random.Generator, batch: int, n_nodes: int, n_agents: int) -> dict[str, np.ndarray]:
         """A world with the same fields in which everything goes as in the plain problem."""
-        usual = {"speeds": 1.0, "service": 0.0, "appears": 0.0, "breaks": np.inf, "traffic": 1.0}
-        return {name: np.full((batch, *shape), usual[name]) for name, shape in world}
+        return {name: np.full((batch, *shape), FIELDS[name].usual) for name, shape in world}
 
     options = {"device": device, "check_actions": False}
     return BatchedMTSP(n_nodes, n_agents, batch, speed, depot, scenario=uneventful, **options)
