@@ -211,6 +211,7 @@ def test_a_sharper_clip_is_for_samples_alone(network, monkeypatch, decode, clip)
 
 
 @pytest.mark.parametrize(("n_nodes", "view", "seen"), [(399, None, 398), (420, None, 100), (60, 7, 7), (60, 90, 59)])
+@pytest.mark.slow
 def test_large_instances_are_seen_in_part(monkeypatch, n_nodes, view, seen):
     """From n = 400 on the nearest 100 cities, or as many as the option says."""
     longest = []

@@ -135,6 +135,7 @@ def test_weights_of_zero_and_networks_without_the_outputs_need_no_plans():
         assert {*keys, *(PLAN_KEYS if plans else ())} <= set(batch.keys(include_nested=True))
 
 
+@pytest.mark.slow
 def test_resume_is_bit_identical(tmp_path, monkeypatch):
     imitate(replace(TINY, out=tmp_path / "whole"))
 

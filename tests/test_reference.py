@@ -102,6 +102,7 @@ def test_without_iterations_the_result_is_greedy_insertion() -> None:
         assert [min(tour, tour[::-1]) for tour in tours] == [min(tour, tour[::-1]) for tour in expected]
 
 
+@pytest.mark.slow
 def test_greedy_insertion_next_to_near_cities_is_nearly_as_short_as_anywhere() -> None:
     """n = 120: a city goes next to one of its 40 nearest or to the depot, not next to any other city."""
     ratios = []

@@ -52,6 +52,7 @@ def last_makespan(env: AECEnv) -> float:
 
 
 @pytest.mark.parametrize("depot", ["open", "wait", "final"])
+@pytest.mark.slow
 def test_in_a_plain_world_it_follows_the_reference_solver(depot: str) -> None:
     """With ample iterations, bit for bit; the plan is made once and within 1 % of the best makespan."""
     env = mtsp_v0.env(n_nodes=20, n_agents=3, depot=depot)
@@ -133,6 +134,7 @@ def service_and_breakdowns(rng: np.random.Generator, batch: int, n_nodes: int, n
 
 @pytest.mark.parametrize("depot", ["open", "wait"])
 @pytest.mark.parametrize("scenario", SCENARIOS)
+@pytest.mark.slow
 def test_it_beats_the_nearest_city_in_every_scenario(scenario: str, depot: str) -> None:
     """Mean makespan of 30 games, seeds 0 to 29, all of them played to the end."""
     env = mtsp_v0.env(n_nodes=20, n_agents=3, scenario=scenario, depot=depot)
@@ -184,6 +186,7 @@ def test_milliseconds_limit_the_search() -> None:
 
 
 @pytest.mark.parametrize("scenario", [long_everything, long_traffic])
+@pytest.mark.slow
 def test_decisions_do_not_depend_on_the_future(scenario: Generator) -> None:
     """Until the moment from which the future differs, the decisions are the same; then some of them differ."""
     differ = 0

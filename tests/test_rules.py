@@ -16,8 +16,10 @@ from hypothesis import strategies as st
 from mtsp_env import Instance, check_tours, makespan, rules
 from mtsp_env.instance import FIELDS, Problem
 
+SEEDS = [range(start, start + 10) for start in range(0, 80, 10)]
 
-@pytest.mark.parametrize("seeds", [range(start, start + 10) for start in range(0, 80, 10)], ids=str)
+
+@pytest.mark.parametrize("seeds", [SEEDS[0], *(pytest.param(s, marks=pytest.mark.slow) for s in SEEDS[1:])], ids=str)
 @pytest.mark.parametrize("face", FACES)
 def test_every_decision_is_algorithm_1s(face: str, seeds: range) -> None:
     for seed in seeds:  # 4 games each

@@ -95,6 +95,7 @@ def test_a_damaged_checkpoint_can_be_replaced_by_the_one_before_it(tmp_path):
 
 
 @pytest.mark.parametrize("lacks", ["config", "network", "random", "progress", "optimiser", "baseline"])
+@pytest.mark.slow
 def test_a_checkpoint_that_lacks_a_part_is_refused(tmp_path, lacks):
     run = replace(TINY, out=tmp_path, steps=1)
     learner = ReinforceLearner(run)
@@ -156,6 +157,7 @@ def test_a_run_that_ends_before_its_first_validation_has_best_weights_too(tmp_pa
     assert learner.best < np.inf
 
 
+@pytest.mark.slow
 def test_a_custom_network_is_trained_saved_and_continued(tmp_path):
     policy = "benchmarks.policies.attention_model:AttentionModel"
     learner = reinforce(replace(TINY, out=tmp_path, policy=policy, steps=2))

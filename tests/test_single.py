@@ -36,6 +36,7 @@ class LegalMinMaxMTSP(MinMaxMTSP):
 
 
 @on_settings
+@pytest.mark.slow
 def test_gymnasiums_checker_passes_if_actions_are_legal(settings: dict, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("matplotlib", reason="the checker renders")
     specification = gymnasium.envs.registration.EnvSpec("LegalMinMaxMTSP-v0", entry_point=LegalMinMaxMTSP)

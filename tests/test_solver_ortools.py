@@ -52,6 +52,7 @@ def test_guided_search_goes_on_until_its_time_is_over():
 
 
 @pytest.mark.parametrize("search", SEARCHES)
+@pytest.mark.slow
 def test_the_time_limit_holds_for_a_thousand_nodes(search):
     (instance,) = Cell(1000, 10, 1).instances(0)
     began = time.process_time()  # the processor may be shared

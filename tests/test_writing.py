@@ -100,6 +100,7 @@ def test_a_device_is_written_and_stays_a_device(tmp_path):
 
 @pytest.mark.parametrize("path", ["/dev/stdout", "/dev/fd/1", "/proc/self/fd/1", "link"])
 @pytest.mark.parametrize("to_file", [True, False], ids=["file", "pipe"])
+@pytest.mark.slow
 def test_standard_output_is_written_where_it_stands(tmp_path, path, to_file):
     """Between what is printed before and after, also if a shell has redirected it to a file."""
     if not os.path.exists("/proc/self/fd"):
