@@ -6,7 +6,7 @@ The policy stays decentralised: one agent's observation in, logits of that agent
 
 A transformer that is given coordinates has to learn what is near. With ``JointConfig.distances``, each head adds a
 learned multiple of the distance between two tokens to its attention scores, as ALiBi does along a text (Press et al.
-2022) and ICAM for routing (Zhou et al. 2024), and so do the pointers.
+2022) and ICAM for routing (Zhou et al. 2024). The logits get such a term as well.
 
 In worlds it can read further keys (``JointConfig.reads``). Each adds a learned vector to some tokens, times how far the
 value is from its neutral one. The vectors begin as zero, so that weights without them go on as they are; a key that an
@@ -198,8 +198,8 @@ class JointDAN(nn.Module):
 def token_distances(agents: Tensor, nodes: Tensor, n_open: Tensor) -> Tensor:
     """Distances between agents' destinations and nodes, in multiples of the typical distance between neighbours.
 
-    An agent has its remaining travel time still to go, so that this counts as well: from an agent to a node, it is how
-    long the agent takes to get there if it goes there next.
+    An agent's remaining travel time is added: what is between an agent and a node is the time until the agent can be
+    there, at speed 1, if it goes there next.
 
     Args:
         agents: (B, m, 3), destinations and remaining travel times.

@@ -41,7 +41,7 @@ class ArrayField:
         high: greatest value; infinity is allowed only if this is ``math.inf``.
         zero_at_depot: whether entry 0 must be 0.
         check: a further check of the array ``(..., *shape)``; returns what is wrong, or None.
-        usual: of a world field, the value with which agents move as in a plain game.
+        usual: the value of a world field with which agents move as in a plain game; None: not a world field.
         needs: the world field without which a game does not have this array; None: every game has it.
     """
 

@@ -120,7 +120,7 @@ def test_weights_start_to_read_with_no_effect(tmp_path):
     for name, tensor in network.state_dict().items():
         assert torch.equal(tensor, plain.state_dict()[name] if name in plain.state_dict() else torch.zeros(16))
     save(tmp_path / "reading.safetensors", network)
-    with pytest.raises(RuntimeError, match="Unexpected key"):
+    with pytest.raises(ValueError, match=r"would leave out weights that init='.*' holds: \['effect.agent_speeds'\]"):
         make_network(replace(config, init=str(tmp_path / "reading.safetensors"), reads=("service",)))
     assert load(tmp_path / "reading.safetensors").config.reads == ("service", "agent_speeds")
     with pytest.raises(ValueError, match="reads must be None: the policy 'dan' has no such option"):
@@ -139,3 +139,5 @@ def test_weights_start_to_use_distances_with_no_effect(tmp_path):
     assert torch.allclose(network(*keys), plain(*keys), atol=1e-5)
     save(tmp_path / "distances.safetensors", network)
     assert load(tmp_path / "distances.safetensors").config.distances
+    with pytest.raises(ValueError, match=r"would leave out weights .*'assignment_slope', 'distance_slopes'"):
+        make_network(replace(config, init=str(tmp_path / "distances.safetensors"), distances=False))

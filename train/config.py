@@ -14,6 +14,9 @@ from dan_policy.registry import NETWORKS
 from mtsp_env.checks import check_count, check_seconds
 from mtsp_env.distributions import Generator, check_distribution, check_scenario
 
+OVERRIDES = ("prune_visited", "reads", "distances")
+"""Options of a network that a run may change in the weights of ``init``."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig:
@@ -71,8 +74,8 @@ class RunConfig:
     """With `init`: override which extra keys of observations in worlds the network reads. New ones have no effect
     before they are learnt."""
     distances: bool | None = None
-    """With `init`: override whether the attention and the logits of the joint network depend on distances. They have no
-    effect before they are learnt."""
+    """With `init`: override whether the attention and the logits of the joint network depend on distances. At first
+    they have no effect."""
     max_grad_norm: float = 1.0
     """Gradients are scaled down to this norm if theirs is larger."""
     average: float = 0.0
@@ -127,7 +130,7 @@ class RunConfig:
             raise ValueError(f"policy must be package.module:factory or one of {sorted(NETWORKS)}, got {self.policy!r}")
         if self.registered and self.policy_options:
             raise ValueError(f"policy_options must be empty for the policy {self.policy!r}, got {self.policy_options}")
-        for name in ("prune_visited", "reads", "distances"):
+        for name in OVERRIDES:
             value = getattr(self, name)
             if value is not None and (self.init is None or not self.registered):
                 raise ValueError(f"{name} must be None unless a registered policy starts from init, got {value}")

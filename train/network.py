@@ -15,7 +15,7 @@ from torchrl.modules import ProbabilisticActor
 from dan_policy.actor import Key, make_actor
 from dan_policy.registry import NETWORKS, build, load, save
 from mtsp_env.batched import BatchedMTSP
-from train.config import RunConfig
+from train.config import OVERRIDES, RunConfig
 from train.supervised_config import ImitateConfig
 
 
@@ -85,14 +85,16 @@ def observation_keys(network: nn.Module) -> tuple[Key, ...]:
 
 def _changed(network: nn.Module, config: RunConfig) -> nn.Module:
     """The same weights in a network with what the run overrides, if anything. Parameters that it adds begin as zero."""
-    given = {"prune_visited": config.prune_visited, "reads": config.reads, "distances": config.distances}
-    changes = {name: value for name, value in given.items() if value is not None}
+    changes = {name: getattr(config, name) for name in OVERRIDES if getattr(config, name) is not None}
     if not changes:
         return network
     options: dict[str, Any] = asdict(network.config) if is_dataclass(network.config) else {}
     for name in changes.keys() - options.keys():
         raise ValueError(f"{name} must be None: the policy {config.policy!r} has no such option")
     changed = build(config.policy, options | changes)
+    lost = sorted(network.state_dict().keys() - changed.state_dict().keys())
+    if lost:
+        raise ValueError(f"{changes} would leave out weights that init={config.init!r} holds: {lost}")
     added = {name: torch.zeros_like(tensor) for name, tensor in changed.state_dict().items()}
     changed.load_state_dict(added | network.state_dict())
     return changed.eval()
