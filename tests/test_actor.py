@@ -20,6 +20,7 @@ def network():
     return DAN(SMALL).eval()
 
 
+@pytest.mark.slow
 def test_visited_cities_get_probability_zero(network):
     env = BatchedMTSP(12, 3, [8], seed=0)
     actor, td = make_actor(network), env.reset()

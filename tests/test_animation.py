@@ -36,6 +36,7 @@ def has_colour(frame: np.ndarray, colour: str) -> bool:
     return bool((np.abs(frame.astype(int) - rgb).max(axis=-1) <= 10).any())
 
 
+@pytest.mark.slow
 def test_a_gif_shows_the_team_from_the_depot_to_the_end(tmp_path, square, square_tours) -> None:
     animate(tmp_path / "a.gif", square, square_tours, **SHORT)
     frames, durations = frames_of(tmp_path / "a.gif")
@@ -48,6 +49,7 @@ def test_a_gif_shows_the_team_from_the_depot_to_the_end(tmp_path, square, square
     assert list(tmp_path.iterdir()) == [tmp_path / "a.gif"]
 
 
+@pytest.mark.slow
 def test_tours_and_their_log_look_the_same(tmp_path, square, square_tours) -> None:
     animate(tmp_path / "tours.gif", square, square_tours, **SHORT)
     animate(tmp_path / "log.gif", square, log=make_log(square, square_tours), **SHORT)
@@ -72,11 +74,13 @@ def test_a_moment_is_drawn_as_it_is(square: Instance, square_tours: list[list[in
     assert ax.get_title() == "square: 6 cities, 2 agents, makespan 2"
 
 
+@pytest.mark.slow
 def test_nobody_goes_anywhere(tmp_path) -> None:
     animate(tmp_path / "a.gif", Instance([[0.5, 0.5]] * 3, 2), [[0, 1, 2, 0], [0, 0]], **SHORT)
     assert (tmp_path / "a.gif").stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_an_mp4_has_all_frames_and_two_seconds_more(tmp_path, square, square_tours) -> None:
     ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the extra video")
     animate(tmp_path / "a.MP4", square, square_tours, **SHORT)

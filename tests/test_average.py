@@ -24,6 +24,7 @@ def files(tmp_path) -> list[str]:
     return [str(tmp_path / f"{name}.safetensors") for name in ("a", "b")]
 
 
+@pytest.mark.slow
 def test_the_average_is_the_mean_of_every_weight(files, tmp_path):
     out = tmp_path / "new" / "mean.safetensors"
     assert main(["average", *files, files[0], "--out", str(out)]) == 0
@@ -34,6 +35,7 @@ def test_the_average_is_the_mean_of_every_weight(files, tmp_path):
     assert load_extra(out) == {"averaged": [{"step": "a"}, {"step": "b"}, {"step": "a"}]}
 
 
+@pytest.mark.slow
 def test_validation_is_that_of_the_runs(files, tmp_path, capsys):
     small = {"n_nodes": (10, 12), "n_agents": (2, 2), "validation_instances": 6, "tensorboard": False}
     run = reinforce(replace(REFINE, out=tmp_path / "run", init=files[0], steps=1, validate_every=1, **small))
@@ -52,6 +54,7 @@ def test_files_without_extra_data_are_averaged(files, tmp_path):
     assert load_extra(out) == {"averaged": [{}, {"step": "b"}]}
 
 
+@pytest.mark.slow
 def test_what_cannot_be_averaged_is_refused(files, tmp_path, capsys):
     out, other = tmp_path / "mean.safetensors", tmp_path / "other.safetensors"
     save(other, DAN(DANConfig(embed_dim=16, feedforward_dim=16, n_heads=2, city_layers=1)))

@@ -143,6 +143,7 @@ def test_a_row_of_many_equals_a_batch_of_one(depot):
             one = step_mdp(alone.step(one.set("action", step["action"][row : row + 1])))
 
 
+@pytest.mark.slow
 def test_auto_reset_never_offers_or_takes_an_illegal_action():
     env = make(batch=500, n_nodes=8, n_agents=3, depot="open")
     td, decisions, resets = env.reset(), 0, 0

@@ -96,6 +96,7 @@ def test_games_go_on_from_any_saved_state(scenario: str) -> None:
     assert same(resumed, td.exclude("action"))
 
 
+@pytest.mark.slow
 @in_every_scenario
 @pytest.mark.parametrize("name", ["default", "joint"])
 def test_networks_that_know_no_worlds_play_in_each(scenario: str, name: str) -> None:

@@ -212,6 +212,7 @@ def test_our_solvers_solve_tiny_instances_and_repeat_themselves(name):
         assert makespan(instance, again) == pytest.approx(makespan(instance, tours))
 
 
+@pytest.mark.slow
 def test_naming_solvers_loads_none_and_each_has_a_file():
     code = "import sys; import benchmarks.harness.worker, benchmarks.harness.run; print(sorted(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
@@ -257,6 +258,7 @@ def test_speed_is_work_over_time(monkeypatch):
     assert timing.per_second(lambda: 6, seconds=3.0) == 6 * 2 / 4  # the second ends after 4 s
 
 
+@pytest.mark.slow
 def test_solving_is_timed_and_its_memory_is_measured(monkeypatch):
     monkeypatch.setattr(
         speed_solve.torch, "set_num_threads", lambda threads: None
@@ -295,6 +297,7 @@ def test_the_speed_of_training_counts_what_is_done():
     assert speed_train.teaching(6, 2, 0.01) > 0
 
 
+@pytest.mark.slow
 def test_peers_are_measured_in_turns_and_compared(monkeypatch, tmp_path):
     """A peer whose steps take 100 s each is slower than ours."""
     calls = []

@@ -24,6 +24,7 @@ def test_what_is_written_is_read(path):
     assert [file.name for file in path.parent.iterdir()] == ["checkpoint.pt"]
 
 
+@pytest.mark.slow
 def test_every_flipped_bit_is_noticed(path):
     """The first bytes bit by bit, the rest at random."""
     whole = path.read_bytes()

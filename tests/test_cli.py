@@ -116,6 +116,7 @@ def improved(monkeypatch) -> list[dict]:
     return calls
 
 
+@pytest.mark.slow
 def test_the_reference_solves_in_the_policys_place(folder, solver, improved, capsys) -> None:
     assert main(["solve", "square.json", "ten.tsp", "--agents", "2", "--json", "--method", "reference"]) == 0
     assert main(["solve", "square.json", "--json", "--method", "reference", "--seconds", "1.5", "--seed", "8"]) == 0
@@ -207,6 +208,7 @@ def test_a_teams_tours_have_their_times_everywhere(folder, solver, square: Insta
     assert '"longest": 1' in page
 
 
+@pytest.mark.slow
 def test_several_files_get_their_names_into_the_outputs(folder, solver, capsys) -> None:
     Path("again.tsp").write_text(Path("ten.tsp").read_text())
     write_instance("slash.json", Instance([[0.0, 0.0], [1.0, 1.0]], 1, name="../a b"))

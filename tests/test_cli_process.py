@@ -63,6 +63,7 @@ def test_the_reference_alone_needs_no_torch(folder, square: Instance) -> None:
     assert without_rich.stdout == without_numba.stdout == ""
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="pipes break differently there")
 def test_a_reader_that_closes_the_pipe_is_no_error(tmp_path) -> None:
     reader, writer = os.pipe()
@@ -73,6 +74,7 @@ def test_a_reader_that_closes_the_pipe_is_no_error(tmp_path) -> None:
     assert (done.returncode, done.stderr) == (1, "")
 
 
+@pytest.mark.slow
 def test_solves_with_a_policy_from_a_file(folder, capsys) -> None:
     """Nothing is faked: an untrained network plans tours that the judge accepts."""
     pytest.importorskip("torchrl", reason="needs the extra dan")

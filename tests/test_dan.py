@@ -39,6 +39,7 @@ def open_logits(network, cities, agents, visited):
     return network(cities, agents, visited).masked_fill(visited, 0.0)
 
 
+@pytest.mark.slow
 def test_permuting_cities_permutes_logits(network):
     cities, agents, visited = observation()
     order = torch.cat([torch.zeros(1, dtype=torch.int64), torch.randperm(8) + 1])  # the depot has its own embedding

@@ -129,6 +129,7 @@ def test_a_signal_to_all_processes_and_torchrun_saves_the_same_step_in_each(tmp_
     assert steps == [log.read_text().count("\n")] * 2
 
 
+@pytest.mark.slow
 def test_processes_without_a_common_checkpoint_all_say_so(tmp_path, monkeypatch):
     """The other process has saved steps 6 and 7."""
     learner = ReinforceLearner(replace(TINY, out=tmp_path, steps=5, resume=True, validation_instances=2))

@@ -21,6 +21,7 @@ def network():
     return DAN(SMALL).eval()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depot", ["open", "final"])
 def test_an_episode_holds_each_decision_once_and_nothing_after_its_end(network, depot):
     env = BatchedMTSP(9, 3, [16], speed=0.1, depot=depot, seed=0)

@@ -52,6 +52,7 @@ def test_a_greedy_game_is_the_environments_greedy_episode(policy):
     assert best_tours(play(policy, begin(instance, GAME), GAME)) == env.tours(episode.last)[0]
 
 
+@pytest.mark.slow
 def test_samples_follow_the_softmax_over_legal_nodes():
     """The first decision of many games, at which the depot is not legal, however large its logit."""
     instance = uniform(np.random.default_rng(6), 3, 1)

@@ -44,6 +44,7 @@ def solved(draw):
     return Instance(rng.random((n_nodes, 2)), n_agents), [[*tour, 0] for tour in tours]
 
 
+@pytest.mark.slow
 @given(solved())
 @settings(max_examples=200, deadline=None)
 def test_canonical_tours_solve_the_same_instance_no_worse_and_in_one_order(case):
@@ -58,6 +59,7 @@ def test_canonical_tours_solve_the_same_instance_no_worse_and_in_one_order(case)
         assert [t for t in canonical(instance.nodes, turned) if len(t) > 3] == [t for t in ordered if len(t) > 3]
 
 
+@pytest.mark.slow
 @given(solved(), st.data())
 @settings(max_examples=200, deadline=None)
 def test_canonical_tours_keep_their_prefixes(case, data):
@@ -113,6 +115,7 @@ def test_a_replayed_set_holds_every_decision_of_the_teachers_tours():
     assert decisions["action_mask"].gather(2, decisions["action"][..., None])[..., 0][valid].all()
 
 
+@pytest.mark.slow
 def test_sets_depend_on_their_index_alone_and_the_teacher_is_near_optimal():
     one, again, other = demonstrate(TINY, 5), demonstrate(TINY, 5), demonstrate(TINY, 6)
     assert all(np.array_equal(a, b) for a, b in zip(one, again, strict=True))
@@ -188,6 +191,7 @@ def test_workers_make_the_same_sets(student):
     assert torch.equal(*cities)
 
 
+@pytest.mark.slow
 def test_every_decision_of_a_set_is_drawn_once():
     buffer = Buffer(replace(TINY, sets_per_step=1, buffer=1), KEYS, np.random.default_rng(0))
     decisions, valid = as_decisions(demonstrate(TINY, 0), KEYS, TINY)
@@ -225,6 +229,7 @@ def test_resume_is_bit_identical(tmp_path, monkeypatch, student):
     assert whole["progress"]["best"] == parts["progress"]["best"]
 
 
+@pytest.mark.slow
 def test_a_run_cannot_be_resumed_with_another_student(tmp_path, student):
     run = replace(student, out=tmp_path / "run", steps=2)
     imitate(run)

@@ -132,6 +132,7 @@ def cycles(graph: dict[str, set[str]]) -> list[list[str]]:
     return [sorted(component) for component in components if len(component) > 1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", PACKAGES)
 def test_modules_do_not_import_each_other_in_circles(package: str) -> None:
     """Imports within functions and for type checkers also count."""
@@ -161,6 +162,7 @@ def test_light_modules_import_no_extra_at_import(module: str) -> None:
     assert not top_level & NEEDS_AN_EXTRA
 
 
+@pytest.mark.slow
 def test_the_environment_imports_light() -> None:
     """Importing it loads no heavy package, not even indirectly, and keeps NumPy's global random state."""
     code = f"""

@@ -83,6 +83,7 @@ def test_one_step_raises_the_likelihood_of_the_best_games(network):
     assert learner.instances == 4 and learner.step == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", ["joint", "dan"])
 def test_both_networks_improve_without_a_teacher(policy):
     learner = ImproveLearner(replace(TINY, policy=policy, rotate=True))

@@ -105,6 +105,7 @@ def test_a_file_that_does_not_fit_into_the_memory_is_refused(tmp_path, monkeypat
 # Sizes
 
 
+@pytest.mark.slow
 def test_agents_beyond_the_cities_take_no_part_in_games(monkeypatch) -> None:
     instance = uniform(np.random.default_rng(5), 20, 10_000)
     played = []
@@ -198,6 +199,7 @@ def test_control_characters_are_not_printed(folder, capsys) -> None:
     assert "\x1b" not in refused(capsys, "solve", "\x1b[31m.tsp", "--agents", "1")
 
 
+@pytest.mark.slow
 def test_in_a_folder_that_is_gone_the_command_works_with_whole_paths(tmp_path) -> None:
     gone = tmp_path / "gone"
     code = (
@@ -219,6 +221,7 @@ def test_a_loop_of_links_is_refused(folder, capsys) -> None:
     assert "loop.json: cannot write it" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_half_a_character_in_a_file_name_is_printed(tmp_path) -> None:
     done = run("generate", "--nodes", "5", "--agents", "2", os.fsdecode(os.fsencode(tmp_path) + b"/\xff.json"))
     assert (done.returncode, done.stderr) == (0, "")

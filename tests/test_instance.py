@@ -117,6 +117,7 @@ def test_equal_instances_have_equal_hashes_even_with_negative_zero() -> None:
 # Any coordinates
 
 
+@pytest.mark.slow
 @given(
     xy=st.integers(2, 8).flatmap(lambda n: arrays(np.float64, (n, 2), elements=st.floats(-1e6, 1e6))),
     n_agents=st.integers(1, 5),
@@ -154,6 +155,7 @@ def test_from_coordinates_refuses(xy: list, message: str) -> None:
 # Distributions
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distribution", DISTRIBUTIONS)
 @given(seed=st.integers(0, 2**32), batch=st.integers(0, 4), n_nodes=st.integers(2, 30))
 def test_samples_lie_in_the_unit_square_and_follow_the_seed(
@@ -211,6 +213,7 @@ def test_bad_samples_are_refused() -> None:
 # Files
 
 
+@pytest.mark.slow
 @given(instance=instances, n_agents=st.none() | st.integers(1, 5))
 def test_instance_file_round_trip(tmp_path_factory, instance: Instance, n_agents: int | None) -> None:
     path = tmp_path_factory.mktemp("instance") / "a.json"
@@ -225,6 +228,7 @@ def test_numpy_scalars_can_be_written(tmp_path) -> None:
     assert read_instance(tmp_path / "a.json") == instance
 
 
+@pytest.mark.slow
 @given(tours=st.lists(st.lists(st.integers(0, 99))), seconds=st.floats(0, 9))
 def test_tours_file_round_trip(tmp_path_factory, tours: list, seconds: float) -> None:
     path = tmp_path_factory.mktemp("tours") / "a.json"

@@ -45,6 +45,7 @@ def test_all_keys_that_worlds_add_can_be_read():
     assert set(READABLE) == set(OBSERVED)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", SCENARIOS)
 @pytest.mark.parametrize("options", [{}, {"view": 4, "hearing": 0.3}])
 def test_before_it_is_learnt_reading_changes_nothing(scenario, options):
@@ -118,6 +119,7 @@ def test_files_keep_what_is_read_and_older_files_read_nothing(tmp_path):
     assert load("joint").config.reads == () and load("joint").in_keys == PLAIN_KEYS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["plain", "team", "everything"])
 def test_it_plays_in_every_world_as_an_actor(scenario):
     _, reading = networks(learnt=True)
@@ -129,6 +131,7 @@ def test_it_plays_in_every_world_as_an_actor(scenario):
     assert bool(one.last["terminated"].all())
 
 
+@pytest.mark.slow
 def test_plain_instances_are_solved_as_by_the_plain_network():
     plain, reading = networks()
     instance = uniform(np.random.default_rng(4), 15, 3)

@@ -126,6 +126,7 @@ def test_two_submissions_of_one_name_are_refused(tmp_path):
         leaderboard(out=tmp_path / "page.md")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "knows"),
     [
@@ -167,6 +168,7 @@ def few_worlds(monkeypatch, tmp_path):
     return cell
 
 
+@pytest.mark.slow
 def test_games_in_worlds_are_played_again(tmp_path, few_worlds):
     out, page = tmp_path / "mine.json", tmp_path / "page.md"
     about = ["--method", "M", "--by", "B", "--test-set", "worlds", "--out", str(out)]
@@ -182,6 +184,7 @@ def test_games_in_worlds_are_played_again(tmp_path, few_worlds):
     assert f"{sum(50 * (cost - 2) for cost in costs) / 2:.1f} ±" in line
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -33,6 +33,7 @@ def small(monkeypatch):
     monkeypatch.setitem(curves.SETTING, "validation_instances", 8)
 
 
+@pytest.mark.slow
 def test_gaps_are_to_the_best_known_tours():
     class Nearest(torch.nn.Module):
         def forward(self, cities, agents, visited):

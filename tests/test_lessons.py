@@ -114,6 +114,7 @@ def test_routes_from_the_depot_are_canonical_and_only_agents_that_are_alike_are_
         assert canonical_routes(away, [[1], [4, 3]]) == [[1], [3, 4]]  # agent 0 has left
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", WORLDS)
 def test_every_label_fits_its_decision(scenario, student):
     for config in (replace(TINY, scenario=(scenario,)), replace(student, scenario=(scenario,))):
@@ -134,6 +135,7 @@ def test_every_label_fits_its_decision(scenario, student):
             assert torch.equal(plan["closed"], ~one["agent_alive"])
 
 
+@pytest.mark.slow
 def test_teachers_games_solve_every_instance():
     """Without a student, the teacher plays each game to its end."""
     for scenario in WORLDS:
@@ -144,6 +146,7 @@ def test_teachers_games_solve_every_instance():
             assert set(range(1, lessons.arrays["visited"].shape[2])) <= set(chosen.tolist())
 
 
+@pytest.mark.slow
 def test_the_student_plays_until_few_cities_are_left():
     config = replace(TINY, roll_in="joint", scenario=("arrivals",))
     problem = draw(np.random.default_rng(8), config, 4, size=(9, 3))
@@ -198,6 +201,7 @@ def test_plain_sets_are_those_of_before(student):
     assert np.array_equal(one.nodes, rng.random((len(one.nodes), n_nodes, 2)))
 
 
+@pytest.mark.slow
 def test_losses_in_worlds_have_gradients_for_everything_that_is_read(student):
     torch.manual_seed(0)
     network = JointDAN(TINY.joint)

@@ -46,6 +46,7 @@ def test_a_damaged_file_is_named(tmp_path, content):
         write(tmp_path, 3, 3, step=2)
 
 
+@pytest.mark.slow
 def test_tensorboard_shows_every_step_once(tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 

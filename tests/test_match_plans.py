@@ -77,6 +77,7 @@ def exchanges(decisions):
         yield changed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("outputs", ["both", "next", "assignment", "policy"])
 def test_no_exchange_of_tours_has_a_smaller_loss(decisions, seed, outputs):

@@ -82,6 +82,7 @@ def test_pettingzoo_seed(settings: dict) -> None:
     seed_test(lambda: mtsp_v0.env(**settings), num_cycles=100)
 
 
+@pytest.mark.slow
 @on_grid
 def test_pettingzoo_state(settings: dict) -> None:
     with warnings.catch_warnings():
@@ -93,6 +94,7 @@ def test_pettingzoo_state(settings: dict) -> None:
     assert env.state_space.contains(env.state())
 
 
+@pytest.mark.slow
 def test_pettingzoo_render(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MPLBACKEND", "Agg")
     pytest.importorskip("matplotlib").use("Agg")

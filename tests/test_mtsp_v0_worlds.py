@@ -98,6 +98,7 @@ def test_rewards_sum_to_the_judged_makespan(scenario: str) -> None:
         assert paid == pytest.approx(-env.infos["agent_2"]["makespan"], abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scenario", "depot"),
     [(long_everything, "open"), (long_everything, "wait"), (long_traffic, "wait"), (long_traffic, "final")],

@@ -44,6 +44,7 @@ def play_in_the_environment(instance: Instance, policy) -> list[Decision]:
     return decisions
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [0.01, 0.1])
 def test_beliefs_are_what_the_environment_shows(speed: float) -> None:
     """Bit for bit, in random games in which half of the agents break down, without any socket."""

@@ -23,6 +23,7 @@ def network():
     return DAN(SMALL).eval()
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(
     st.integers(2, 12), st.integers(1, 15), st.integers(0, 2**31), st.sampled_from(["greedy", "sample"]), st.booleans()
@@ -44,6 +45,7 @@ def test_seeded_plans_repeat(network):
     assert (first.method, solve(instance, network).method) == ("dan(s.4)", "dan(g.)")
 
 
+@pytest.mark.slow
 def test_more_samples_are_never_worse_than_the_first_of_them(network):
     instance = uniform(np.random.default_rng(2), 15, 3)
     costs = [solve(instance, network, decode="sample", samples=64, seed=seed).makespan for seed in range(3)]
@@ -51,6 +53,7 @@ def test_more_samples_are_never_worse_than_the_first_of_them(network):
     assert max(costs) < np.mean(singles)
 
 
+@pytest.mark.slow
 def test_augmented_plans_are_the_best_of_the_eight_views(network):
     instance = uniform(np.random.default_rng(7), 14, 3)
     centred = [instance.nodes - 0.5, (instance.nodes - 0.5) * [-1, 1]]
@@ -84,6 +87,7 @@ def test_any_actor_can_plan():
 # Improvement
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("decode", "name"), [("greedy", "(g.)+improve(0.05 s)"), ("sample", "(s.3)+improve(0.05 s)")])
 def test_improved_plans_are_shorter_and_take_their_time(network, decode, name):
     pytest.importorskip("numba", reason="needs the extra reference")

@@ -85,6 +85,7 @@ class ViewConfig:
     view: int | None = None
 
 
+@pytest.mark.slow
 def test_a_network_that_always_drops_visited_cities_has_the_default_view():
     seen = []
 

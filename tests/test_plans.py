@@ -113,6 +113,7 @@ def test_the_policys_loss_is_the_same_with_and_without_plans(decisions):
     assert dense.next > 0 and dense.assignment > 0 and plain.next == plain.assignment == 0
 
 
+@pytest.mark.slow
 def test_dan_learns_who_visits_each_city():
     dan = DANConfig(embed_dim=16, feedforward_dim=32, n_heads=2, city_layers=1, prune_visited=True, assignment=True)
     learner = ImitationLearner(replace(TINY, policy="dan", network=dan, learning_rate=1e-2))
@@ -121,6 +122,7 @@ def test_dan_learns_who_visits_each_city():
     assert 0 < logs[-1]["assignment_loss"] < logs[0]["assignment_loss"]
 
 
+@pytest.mark.slow
 def test_weights_of_zero_and_networks_without_the_outputs_need_no_plans():
     joint, dan = JointDAN(JOINT), DAN(DANConfig(embed_dim=16, feedforward_dim=32, n_heads=2))
     off = replace(TINY, next_weight=0.0, assignment_weight=0.0)

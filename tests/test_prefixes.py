@@ -51,6 +51,7 @@ def least_makespan(instance: Instance, prefixes: Tours) -> float:
     return best
 
 
+@pytest.mark.slow
 @given(teams_under_way(), st.integers(0, 400), st.booleans())
 @settings(max_examples=200, deadline=None)
 def test_tours_begin_with_the_prefixes_and_are_never_made_worse(case: tuple, iterations: int, start: bool) -> None:
@@ -80,6 +81,7 @@ def test_prefixes_of_agents_at_the_depot_change_nothing(tidy: bool) -> None:
     assert improve_batch(nodes, 4, 500, tidy=tidy, prefixes=[[[0]] * 4] * 3) == without
 
 
+@pytest.mark.slow
 def test_a_plan_with_a_fixed_beginning_is_completed_near_optimally() -> None:
     """n = 60, m = 4: with the first third of near-optimal tours as prefixes, the makespan is within 1 % of theirs."""
     instance = Instance(np.random.default_rng(1).random((60, 2)), 4)
@@ -91,6 +93,7 @@ def test_a_plan_with_a_fixed_beginning_is_completed_near_optimally() -> None:
         improve(instance, plan, prefixes=[list(reversed(plan[0]))[:3], *prefixes[1:]])
 
 
+@pytest.mark.slow
 def test_games_can_be_completed_from_any_decision() -> None:
     """The open tours of a game, ``rules.tours(..., close=False)``, are valid prefixes."""
     env = BatchedMTSP(12, 3, [16], 0.1, depot="final", seed=0)

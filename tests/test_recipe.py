@@ -231,6 +231,7 @@ def test_seconds_stop_a_recipe_and_are_a_stages_budget(written, tmp_path):
     assert [stage["status"] for stage in log_of(tmp_path / "run")["stages"]] == ["complete"] * 4
 
 
+@pytest.mark.slow
 def test_a_stage_that_was_stopped_before_it_was_recorded_is_completed(one_stage, tmp_path):
     out = tmp_path / "run"
     recipe(one_stage, out)
@@ -260,6 +261,7 @@ def test_training_goes_on_from_weights_alone(tiny, tmp_path):
     assert not (out / "first").exists()
 
 
+@pytest.mark.slow
 def test_the_first_stage_may_start_from_weights_too(one_stage, tmp_path):
     out = tmp_path / "run"
     torch.manual_seed(7)
@@ -269,6 +271,7 @@ def test_the_first_stage_may_start_from_weights_too(one_stage, tmp_path):
     assert options["init"] == str(out / "init.safetensors")
 
 
+@pytest.mark.slow
 def test_bad_arguments_are_refused_before_anything_is_written(tiny, written, tmp_path, monkeypatch):
     out = tmp_path / "run"
     for kwargs, message in (
@@ -329,6 +332,7 @@ def test_a_stage_whose_checkpoint_lacks_its_progress_is_refused(one_stage, tmp_p
         recipe(one_stage, tmp_path / "run", resume=True)
 
 
+@pytest.mark.slow
 def test_the_command_line_replaces_device_and_threads(one_stage, tmp_path, capsys):
     out = tmp_path / "run"
     threads = torch.get_num_threads()
@@ -342,6 +346,7 @@ def test_the_command_line_replaces_device_and_threads(one_stage, tmp_path, capsy
     assert "add --resume" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_reinforce_warms_up_before_its_decay():
     from tiny import TINY
 

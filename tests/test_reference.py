@@ -72,6 +72,7 @@ def test_small_instances_are_solved_to_the_optimum(n_nodes: int, n_agents: int) 
         assert makespan(instance, improve(instance, iterations=1000)) == pytest.approx(optimum(instance), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_a_few_milliseconds_give_near_optimal_tours() -> None:
     """n = 50, m = 5: on average 2000 iterations are within 1 % of 20,000; greedy insertion is more than 15 % off."""
     nodes = np.random.default_rng(0).random((12, 50, 2))
@@ -116,6 +117,7 @@ def test_greedy_insertion_next_to_near_cities_is_nearly_as_short_as_anywhere() -
 # Limits
 
 
+@pytest.mark.slow
 def test_large_instances_are_prepared_without_trying_all_pairs(monkeypatch) -> None:
     """Trying all pairs of 20,000 nodes takes seconds."""
     monkeypatch.setattr(sisr, "nearest_cities", lambda *_: pytest.fail("tried all pairs"))
@@ -149,6 +151,7 @@ def test_what_does_not_fit_into_the_memory_is_refused(monkeypatch, n_nodes: int,
 # Any instance
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(instances, st.sampled_from([0, 1, 40]), st.integers(0, 2**70))
 def test_tours_are_valid(instance: Instance, iterations: int, seed: int) -> None:
@@ -158,6 +161,7 @@ def test_tours_are_valid(instance: Instance, iterations: int, seed: int) -> None
     assert all(0 not in tour[1:-1] and all(type(node) is int for node in tour) for tour in tours)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(instances_and_tours(), st.sampled_from([0, 1, 40]))
 def test_given_tours_are_never_made_worse(problem: tuple[Instance, Tours], iterations: int) -> None:
@@ -288,6 +292,7 @@ def test_bad_batches_are_named(nodes: np.ndarray, arguments: dict, message: str)
         improve_batch(nodes, **{"n_agents": 2, **arguments})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", ["numba", "scipy"])
 def test_without_a_package_the_extra_is_named(package: str) -> None:
     code = f"import sys; sys.modules['{package}'] = None\nimport mtsp_env, mtsp_env.reference"

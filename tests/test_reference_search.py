@@ -79,6 +79,7 @@ def test_the_limit_reached_first_ends_the_search(turns: list, seconds: float, it
 # Seeds and batches
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "k"), [(2, 0), (3, 1), (40, 20), (40, 38), (299, 40), (300, 40), (700, 1)])
 @pytest.mark.parametrize("coincide", [False, True])
 def test_nearest_cities(n: int, k: int, coincide: bool) -> None:

@@ -75,6 +75,7 @@ def check_kept(instance: Instance, prefixes: Tours, tours: Tours, stopped: set[i
         assert tour == prefix or not (agent in stopped or is_closed(prefix))
 
 
+@pytest.mark.slow
 @given(worlds())
 @settings(max_examples=60, deadline=None)
 def test_small_instances_are_solved_to_the_optimum(instance: Instance) -> None:
@@ -84,6 +85,7 @@ def test_small_instances_are_solved_to_the_optimum(instance: Instance) -> None:
     assert makespan(instance, tours) == pytest.approx(least, abs=1e-9)
 
 
+@pytest.mark.slow
 @given(teams_under_way())
 @settings(max_examples=60, deadline=None)
 def test_teams_under_way_are_completed_optimally(case: tuple) -> None:
@@ -93,6 +95,7 @@ def test_teams_under_way_are_completed_optimally(case: tuple) -> None:
     assert makespan(instance, tours) == pytest.approx(least_makespan(instance, prefixes, stopped), abs=1e-9)
 
 
+@pytest.mark.slow
 @given(teams_under_way(max_nodes=14, max_agents=5), st.integers(0, 300))
 @settings(max_examples=100, deadline=None)
 def test_given_tours_are_never_made_worse(case: tuple, iterations: int) -> None:
@@ -158,6 +161,7 @@ def test_the_rest_of_the_tours_begins_at_the_heads() -> None:
         plan_rest(instance, [None, None, None], np.zeros(3), [3, 4], iterations=5)
 
 
+@pytest.mark.slow
 @given(worlds(max_nodes=12), st.data())
 @settings(max_examples=60, deadline=None)
 def test_cities_missing_in_the_given_routes_are_inserted(instance: Instance, data: st.DataObject) -> None:

@@ -102,6 +102,7 @@ def test_the_shipped_dans_are_of_the_first_format_and_are_read_as_before():
         assert load(name).config == DANConfig(**json.loads(kept["config"]))
 
 
+@pytest.mark.slow
 def test_the_file_is_as_open_to_others_as_any(tmp_path):
     (tmp_path / "any").write_bytes(b"")
     save(tmp_path / "a.safetensors", DAN(SMALL))
@@ -208,6 +209,7 @@ def test_parameters_that_are_not_finite_are_neither_saved_nor_loaded(tmp_path, f
     assert all(torch.equal(before[key], weight) for key, weight in healthy.state_dict().items())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NETWORKS)
 def test_absurd_configurations_are_refused_before_anything_is_built(tmp_path, name, monkeypatch):
     """Every size and clip of every network of the registry; ``view`` costs nothing."""

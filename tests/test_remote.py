@@ -89,11 +89,13 @@ def test_a_run_with_workers_continues_bit_for_bit(tmp_path, cluster):
         assert torch.equal(weight, parts.network.state_dict()[name]), name
 
 
+@pytest.mark.slow
 def test_more_workers_than_cpus_are_refused(network, cluster):
     with pytest.raises(ValueError, match="ray_workers must be at most Ray's 2 CPUs, got 3"):
         RayWorkers(network, replace(CONFIG, ray_workers=3), first_step=0)
 
 
+@pytest.mark.slow
 def test_without_ray_the_error_names_the_group(network, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ModuleNotFoundError, match="pip install --group ray"):

@@ -141,6 +141,7 @@ def test_invalid_tours_are_refused(square: Instance, tours: list, message: str) 
 # Files
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("suffix", "magic"), [(".png", b"\x89PNG"), (".PNG", b"\x89PNG"), (".svg", b"<?xml"), (".pdf", b"%PDF")]
 )
@@ -198,6 +199,7 @@ def test_each_picture_is_an_array_of_its_own(square: Instance, square_tours: lis
     viewer.close()
 
 
+@pytest.mark.slow
 def test_a_reused_figure_shows_what_a_fresh_one_would(square: Instance, square_tours: list[list[int]]) -> None:
     other = uniform(np.random.default_rng(0), n_nodes=30, n_agents=4)
     tours = [[0, *part, 0] for part in np.array_split(np.arange(1, 30), 4)]
@@ -208,6 +210,7 @@ def test_a_reused_figure_shows_what_a_fresh_one_would(square: Instance, square_t
         assert np.array_equal(used.draw(instance, shown), Viewer(show=False).draw(instance, shown))
 
 
+@pytest.mark.slow
 def test_the_colours_of_all_agents_are_visible(square: Instance, square_tours: list[list[int]]) -> None:
     pixels = {tuple(pixel) for pixel in Viewer(show=False).draw(square, square_tours).reshape(-1, 3).tolist()}
     for colour in (*COLOURS[:2], "black", "white"):
@@ -251,6 +254,7 @@ def test_draws_into_given_axes(square: Instance, square_tours: list[list[int]]) 
 # The environment's pictures, and a machine without matplotlib
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["rgb_array", "human"])
 def test_the_environment_renders_every_step(mode: str) -> None:
     env = mtsp_v0.env(n_nodes=6, n_agents=2, render_mode=mode)
@@ -271,6 +275,7 @@ def test_the_environment_renders_every_step(mode: str) -> None:
     assert pyplot.get_fignums() == []
 
 
+@pytest.mark.slow
 def test_matplotlib_is_imported_only_to_draw() -> None:
     code = "import sys, mtsp_env.render; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
@@ -296,6 +301,7 @@ def known_and_broken(rng: np.random.Generator, batch: int, n_nodes: int, n_agent
     return {"appears": np.zeros((batch, n_nodes)), "breaks": np.full((batch, n_agents), np.inf)}
 
 
+@pytest.mark.slow
 def test_the_environment_shows_who_waits_who_is_broken_and_which_cities_have_appeared() -> None:
     """By hand: agent 0 visits city 1 and waits at home; agent 1 visits city 2 and breaks down on its way to city 3."""
     nodes = [[0.5, 0.5], [0.6, 0.5], [0.3, 0.5], [0.1, 0.5], [0.5, 0.9]]

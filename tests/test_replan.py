@@ -31,6 +31,7 @@ def moments(instance: Instance, seed: int, depot: str = "final") -> list[tuple[r
     return moments
 
 
+@pytest.mark.slow
 @given(st.integers(0, 2**32 - 1), st.integers(2, 12), st.integers(1, 5))
 @settings(max_examples=60, deadline=None)
 def test_prefixes_lead_to_the_moment_at_which_they_were_taken(seed: int, n_nodes: int, n_agents: int) -> None:
@@ -56,6 +57,7 @@ def test_games_side_by_side_begin_at_the_same_moment() -> None:
         assert len(distinct) == (8 if augment else 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", ["default", nearest], ids=["DAN", "nearest"])
 def test_replanning_continues_the_same_plan(policy) -> None:
     """Greedy decisions depend on the current state alone, so replanning from any moment gives the same plan."""

@@ -146,6 +146,7 @@ def test_it_beats_the_nearest_city_in_every_scenario(scenario: str, depot: str) 
     assert np.mean(makespans["replanner"]) < 0.95 * np.mean(makespans["nearest"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depot", ["open", "wait", "final"])
 @pytest.mark.parametrize(("n_nodes", "n_agents"), [(2, 1), (2, 4), (3, 6), (6, 2), (7, 7)])
 def test_odd_sizes_are_played_to_the_end(n_nodes: int, n_agents: int, depot: str) -> None:
@@ -160,6 +161,7 @@ def test_odd_sizes_are_played_to_the_end(n_nodes: int, n_agents: int, depot: str
             play(env, replanner, seed)
 
 
+@pytest.mark.slow
 def test_it_takes_over_a_game_from_others() -> None:
     """It may come in at any moment, and others may decide in between."""
     env, rng = mtsp_v0.env(n_nodes=15, n_agents=3, scenario="everything", depot="wait"), np.random.default_rng(0)
@@ -207,6 +209,7 @@ def test_decisions_do_not_depend_on_the_future(scenario: Generator) -> None:
 # The batched environment
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_batches_are_played_as_single_games(scenario: str) -> None:
     env = BatchedMTSP(12, 3, [4], scenario=scenario, depot="wait", seed=3)
@@ -223,6 +226,7 @@ def test_batches_are_played_as_single_games(scenario: str) -> None:
         assert last_makespan(single) == pytest.approx(env.makespan(td)[row].item(), abs=1e-12)
 
 
+@pytest.mark.slow
 def test_it_is_a_policy_for_rollouts_that_reset_themselves() -> None:
     env = BatchedMTSP(8, 2, [3], scenario="everything", depot="wait", seed=0)
     steps = env.rollout(60, Replanner(iterations=20).policy(env), break_when_any_done=False)

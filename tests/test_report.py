@@ -130,6 +130,7 @@ def test_every_table_has_the_trip_to_the_farthest_city_as_a_bound(tmp_path):
     assert line_of(text, "Gap", BOUND) == [f"{mean:.2f} ± {error:.2f}", f"{mean:.2f} ± {error:.2f} (3)"]
 
 
+@pytest.mark.slow
 def test_the_public_test_set_is_compared_with_published_numbers_of_the_same_instances(tmp_path, monkeypatch):
     """The published gap is that of the means over all 100 instances, however few of them have rows."""
     cell = suite.find_cell("seed3333", "100x5")
@@ -276,6 +277,7 @@ def test_table_3_has_both_lengths_and_names_the_mix_up(tmp_path):
         report([path], tsplib=folder)
 
 
+@pytest.mark.slow
 def test_a_folder_gets_the_tables_and_the_pictures(tmp_path, capsys):
     results = measured("dan-s64", HALVES) + measured("reference", SWAPPED, budget=1.0) + measured("misc:own", HALVES)
     results += [replace(r, budget=10.0) for r in results if r.budget]

@@ -112,6 +112,7 @@ def test_shaped_rewards_sum_to_the_sparse_one(seed: int) -> None:
     np.testing.assert_allclose(total["shaped"], total["sparse"], atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("array", [np.array, torch.tensor], ids=["numpy", "torch"])
 @pytest.mark.parametrize("seed", range(12))
 def test_states_keep_their_shape_and_masks_are_never_empty(seed: int, array: Callable) -> None:
@@ -162,6 +163,7 @@ def test_depart_changes_nothing_in_place() -> None:
     assert all(np.array_equal(array, copies[name]) for name, array in state.arrays().items())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(2, 1), (2, 5), (9, 3), (30, 1), (25, 12)], ids=str)
 @pytest.mark.parametrize("depot", rules.DEPOTS)
 def test_every_policy_ends(depot: str, size: tuple[int, int]) -> None:

@@ -169,6 +169,7 @@ def with_another_future(rng: np.random.Generator, instance: Instance, game: rule
     return Instance(n_agents=instance.n_agents, **arrays)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depot", ["open", "wait"])
 @pytest.mark.parametrize("known", [{}, {"view": 3}, {"hearing": 0.4}], ids=str)
 def test_observations_hold_nothing_about_the_future(depot: str, known: dict) -> None:

@@ -76,6 +76,7 @@ def test_methods_without_a_budget_are_run_once(tmp_path, monkeypatch):
     assert [Limits(limit=60.0).seconds(job) for job in jobs] == [60.0, 1.0, 10.0, 70.0]
 
 
+@pytest.mark.slow
 def test_every_kind_of_failure_is_a_row(tmp_path, monkeypatch):
     monkeypatch.setenv(FOLDER, str(tmp_path))
     kinds = {
@@ -110,6 +111,7 @@ def test_what_hangs_is_killed_with_its_children(tmp_path, monkeypatch):
     wait_until(lambda: not any(alive(pid) for pid in pids))
 
 
+@pytest.mark.slow
 def test_a_hanging_warm_up_is_killed_too(tmp_path):
     row = measure(tmp_path, "hangs_in_the_warm_up", warm_up=1.0)["hangs_in_the_warm_up"]
     assert (row.status, row.error) == ("timeout", "killed: not ready after 1 s")
@@ -146,6 +148,7 @@ def test_a_killed_run_loses_only_the_running_row(tmp_path, signal_number):
     assert [(row.instance, row.status) for row in rows.read(out)] == [(0, "ok"), (1, "ok"), (2, "ok")]
 
 
+@pytest.mark.slow
 def test_failed_rows_are_run_again_only_on_demand(tmp_path, monkeypatch):
     monkeypatch.setenv(FOLDER, str(tmp_path))
     measure(tmp_path, "raises", "deals")
@@ -157,6 +160,7 @@ def test_failed_rows_are_run_again_only_on_demand(tmp_path, monkeypatch):
     assert [row.method for row in again] == ["misbehaving:raises", "misbehaving:deals", "misbehaving:raises"]
 
 
+@pytest.mark.slow
 def test_a_solver_is_warmed_up_once_and_gets_its_own_seed(tmp_path):
     measure(tmp_path, "counts", instances=3, seconds=(0.1,), seed=40)
     results = rows.read(tmp_path / "rows.jsonl")
@@ -164,6 +168,7 @@ def test_a_solver_is_warmed_up_once_and_gets_its_own_seed(tmp_path):
     assert reports == [[2, "8x2-0", 0.1, 40], [3, "8x2-1", 0.1, 41], [4, "8x2-2", 0.1, 42]]  # the first was the warm-up
 
 
+@pytest.mark.slow
 def test_a_worker_has_one_thread_and_one_core(tmp_path):
     report = json.loads(measure(tmp_path, "looks_around")["looks_around"].error.partition(": ")[2])
     assert set(ONE_THREAD.values()) == {"1"} and ONE_THREAD.items() <= report["threads"].items()
@@ -171,6 +176,7 @@ def test_a_worker_has_one_thread_and_one_core(tmp_path):
     assert report["cores"] is None or len(report["cores"]) == 1
 
 
+@pytest.mark.slow
 def test_workers_share_the_rows(tmp_path):
     workers = min(2, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count())
     measure(tmp_path, "deals", "raises", instances=3, workers=workers)
@@ -178,6 +184,7 @@ def test_workers_share_the_rows(tmp_path):
     assert len({row.key for row in results}) == len(results) == 6
 
 
+@pytest.mark.slow
 def test_a_journal_drops_a_torn_line_names_a_damaged_one_and_has_one_writer(tmp_path):
     path = tmp_path / "rows.jsonl"
     row = measure(tmp_path, "deals")["deals"]
@@ -200,6 +207,7 @@ def test_a_journal_drops_a_torn_line_names_a_damaged_one_and_has_one_writer(tmp_
     assert path.read_bytes() == line + b"{}\n" + line
 
 
+@pytest.mark.slow
 def test_other_weights_are_not_mixed_in(tmp_path):
     row = measure(tmp_path, "deals")["deals"]
     ours = solvers.look_up("dan-greedy").versions()["weights"]
@@ -213,6 +221,7 @@ def test_other_weights_are_not_mixed_in(tmp_path):
     assert path.read_bytes() == before
 
 
+@pytest.mark.slow
 def test_table_3_is_measured_rounded_and_not(tmp_path):
     folder = tmp_path / "tsplib"
     folder.mkdir()
@@ -243,6 +252,7 @@ def test_table_3_is_measured_rounded_and_not(tmp_path):
         run("3", tmp_path / "rows.jsonl", ("nearest",))
 
 
+@pytest.mark.slow
 def test_times_may_be_longer_than_a_machine_can_wait(tmp_path):
     times = {"limit": 1e30, "grace": 1e30, "warm_up": 1e30, "seconds": (1e30,)}
     assert measure(tmp_path, "deals", **times)["deals"].ok

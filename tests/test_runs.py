@@ -36,6 +36,7 @@ def test_resume_is_bit_identical(tmp_path, average):
         assert whole["progress"][key] == parts["progress"][key], key
 
 
+@pytest.mark.slow
 def test_an_interrupt_finishes_the_step_and_saves(tmp_path, monkeypatch):
     interrupt_after(3, ReinforceLearner, monkeypatch)
     before = signal.getsignal(signal.SIGINT)
@@ -45,6 +46,7 @@ def test_an_interrupt_finishes_the_step_and_saves(tmp_path, monkeypatch):
     assert signal.getsignal(signal.SIGINT) is before
 
 
+@pytest.mark.slow
 def test_a_run_is_not_overwritten_nor_resumed_as_another(tmp_path):
     reinforce(replace(TINY, out=tmp_path, steps=1))
     with pytest.raises(FileExistsError, match="add --resume"):
@@ -108,6 +110,7 @@ def test_a_checkpoint_that_lacks_a_part_is_refused(tmp_path, lacks):
         reinforce(replace(run, resume=True))
 
 
+@pytest.mark.slow
 def test_one_run_at_a_time_writes_to_a_folder(tmp_path, monkeypatch):
     run = replace(TINY, out=tmp_path, steps=1)
 
@@ -130,6 +133,7 @@ def test_one_run_at_a_time_writes_to_a_folder(tmp_path, monkeypatch):
         reinforce(run)
 
 
+@pytest.mark.slow
 def test_what_a_killed_run_left_is_removed(tmp_path):
     (tmp_path / ".checkpoint.pt.0123.tmp").write_text("half")
     reinforce(replace(TINY, out=tmp_path, steps=1))
@@ -147,6 +151,7 @@ def test_logs_and_weights_are_written(tmp_path):
     assert same(dict(continued.network.state_dict()), dict(learner.network.state_dict()))
 
 
+@pytest.mark.slow
 def test_a_run_that_ends_before_its_first_validation_has_best_weights_too(tmp_path):
     reinforce(replace(TINY, out=tmp_path, steps=1, validate_every=2))
     first = (tmp_path / "best.safetensors").read_bytes()
@@ -189,6 +194,7 @@ def test_what_cannot_be_trained_is_named(options, message):
         ReinforceLearner(replace(TINY, **options))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", [["--batch-size", "100000000000"], ["--validation-instances", "100000000000"]])
 @pytest.mark.parametrize("checked", [True, False])
 def test_a_lack_of_memory_is_one_line(tmp_path, capsys, monkeypatch, checked, option):
@@ -203,6 +209,7 @@ def test_a_lack_of_memory_is_one_line(tmp_path, capsys, monkeypatch, checked, op
     assert re.match(f"train: error: {expected}", printed) and printed.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_dropping_visited_cities_can_be_switched_on_and_off_with_the_same_weights(tmp_path):
     reinforce(replace(TINY, out=tmp_path, steps=1))
     before = load(tmp_path / "last.safetensors")

@@ -134,6 +134,7 @@ def test_an_agent_that_breaks_down_before_it_moves_stays_where_it_is() -> None:
     assert now.owner.tolist() == [-1, -1, -1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_the_log_of_every_world_can_be_shown(scenario: str) -> None:
     env = mtsp_v0.env(n_nodes=15, n_agents=3, scenario=scenario)

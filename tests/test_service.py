@@ -65,6 +65,7 @@ def test_lengths_have_the_units_of_the_request() -> None:
     assert solution["method"] == "reference" and 0 < solution["seconds"] < 5.0
 
 
+@pytest.mark.slow
 def test_the_reference_solver_keeps_the_prefixes() -> None:
     reference.compile_kernels()
     nodes = (100 * np.random.default_rng(0).random((20, 2))).tolist()
@@ -133,6 +134,7 @@ def test_a_full_service_refuses_at_once_and_recovers() -> None:
     assert left == 0
 
 
+@pytest.mark.slow
 def test_an_answer_that_is_late_is_a_503_and_keeps_its_place() -> None:
     release = threading.Event()
 

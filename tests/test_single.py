@@ -165,6 +165,7 @@ def test_bad_arguments(settings: dict, message: str) -> None:
         MinMaxMTSP(**settings)
 
 
+@pytest.mark.slow
 def test_registration_imports_the_view_only_when_it_is_made() -> None:
     code = f"""
 import sys, mtsp_env, gymnasium

@@ -69,6 +69,7 @@ def test_mutations_reverse_move_and_swap(monkeypatch):
     assert {(1, 5, 4, 3, 2, 6, 7), (1, 4, 5, 2, 3, 6, 7), (1, 5, 6, 7, 2, 3, 4), (1, 6, 3, 4, 5, 2, 7)} <= distinct
 
 
+@pytest.mark.slow
 @given(sizes)
 def test_chromosomes_are_tours_as_the_judge_sees_them(size):
     instance, population, _ = of_size(*size)
@@ -106,6 +107,7 @@ def test_the_fittest_of_those_drawn_wins_a_tournament(monkeypatch):
     assert set(ea.tournament(fitness, 50, np.random.default_rng(0))) == {0, 1, 2}
 
 
+@pytest.mark.slow
 def test_tiny_instances_are_solved_in_time_and_reproducibly():
     for instance in Cell(8, 2, 3).instances(0):
         began = time.perf_counter()
@@ -118,6 +120,7 @@ def test_tiny_instances_are_solved_in_time_and_reproducibly():
     assert ea.solve(instance, 60.0, 1, generations=5) != ea.solve(instance, 60.0, 2, generations=5)
 
 
+@pytest.mark.slow
 def test_the_time_limit_holds_for_a_thousand_nodes():
     (instance,) = Cell(1000, 10, 1).instances(0)
     began = time.process_time()  # the processor may be shared
@@ -130,12 +133,14 @@ def test_odd_instances_are_solved(name):
     check_tours(ODD[name], ea.solve(ODD[name], 60.0, 0, generations=10))
 
 
+@pytest.mark.slow
 def test_the_optimum_of_small_instances_is_reached():
     for instance in [*Cell(7, 3, 2).instances(3), *Cell(8, 2, 3).instances(3)]:
         tours = ea.solve(instance, 60.0, 0, generations=300)
         assert makespan(instance, tours) == pytest.approx(optimal_makespan(instance))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weight", [ea.MEAN_WEIGHT, 5.0])  # with 5, the fittest often have long tours
 def test_the_best_tours_are_never_lost(weight, monkeypatch):
     monkeypatch.setattr(ea, "MEAN_WEIGHT", weight)

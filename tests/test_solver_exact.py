@@ -54,6 +54,7 @@ ODD = {
 }
 
 
+@pytest.mark.slow
 @needs_highs
 @pytest.mark.parametrize("instance", SMALL, ids=lambda instance: instance.name)
 def test_proofs_agree_with_trying_everything(instance):
@@ -84,6 +85,7 @@ def test_the_square_is_solved_to_its_optimum_and_again_the_same(square):
     assert exact.solve(square, 60.0, 0) == answer
 
 
+@pytest.mark.slow
 @needs_highs
 def test_three_tiny_instances_are_solved_within_the_time_limit():
     for instance in Cell(8, 2, 3).instances(0):
@@ -93,6 +95,7 @@ def test_three_tiny_instances_are_solved_within_the_time_limit():
         check_tours(instance, answer.tours)
 
 
+@pytest.mark.slow
 @needs_highs
 def test_the_time_limit_holds_if_there_is_no_proof_in_time():
     instance = Cell(40, 3, 1).instances(0)[0]
@@ -104,6 +107,7 @@ def test_the_time_limit_holds_if_there_is_no_proof_in_time():
         exact.solve(instance, 1e-6, 0)
 
 
+@pytest.mark.slow
 @needs_highs
 def test_given_tours_are_the_first_answer():
     instance = Cell(40, 3, 1).instances(0)[0]
@@ -132,6 +136,7 @@ def thirds(instance: Instance) -> list[list[int]]:
     return [[0, *range(1 + agent, instance.n_nodes, m), 0] for agent in range(m)]
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=150)
 @given(data=st.data(), n=st.integers(2, 9), m=st.integers(1, 4), seed=st.integers(0, 10**6))
 def test_the_rows_hold_for_all_tours_within_the_limit(data, n, m, seed):
@@ -199,6 +204,7 @@ def test_an_unknown_backend_is_bad_input(square):
         exact.solve(square, 1.0, 0, "abacus")
 
 
+@pytest.mark.slow
 @needs_highs
 def test_the_table_of_optima_shows_what_is_confirmed(monkeypatch):
     pytest.importorskip("numba")

@@ -82,6 +82,7 @@ def test_three_tiny_instances_are_solved_within_the_time_limit():
         check_tours(instance, tours)
 
 
+@pytest.mark.slow
 @needs_lkh
 def test_equal_seeds_and_trials_give_equal_tours():
     instance = Cell(20, 3, 1).instances(0)[0]
@@ -126,6 +127,7 @@ def test_odd_instances_are_solved(name):
     assert makespan(instance, tours) == pytest.approx(optimum, abs=1e-12)
 
 
+@pytest.mark.slow
 @needs_posix
 def test_the_best_complete_tours_are_read_when_time_is_up(stand_in, square):
     files = {
@@ -141,6 +143,7 @@ def test_the_best_complete_tours_are_read_when_time_is_up(stand_in, square):
     assert is_gone(json.loads(seen.read_text())["pid"])
 
 
+@pytest.mark.slow
 @needs_posix
 def test_no_tours_in_time_raise(stand_in, square):
     stand_in(hangs=True)

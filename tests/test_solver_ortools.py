@@ -33,6 +33,7 @@ def nearest_next(instance: Instance) -> list[int]:
     return [*tour, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("search", SEARCHES)
 def test_tiny_instances_are_solved_in_time_on_one_thread(search):
     for instance in Cell(8, 2, 3).instances(0):
@@ -44,6 +45,7 @@ def test_tiny_instances_are_solved_in_time_on_one_thread(search):
         assert processor < 1.1 * wall + 0.1
 
 
+@pytest.mark.slow
 def test_guided_search_goes_on_until_its_time_is_over():
     (instance,) = Cell(20, 3, 1).instances(0)
     began = time.perf_counter()
@@ -75,6 +77,7 @@ def test_the_first_solution_is_one_agent_that_goes_to_the_nearest_city_next():
         assert sorted(tours) == [[0, 0], [0, 0], nearest_next(instance)]
 
 
+@pytest.mark.slow
 def test_a_descent_is_much_better_and_always_the_same():
     for instance in Cell(20, 3, 2).instances(2):
         first, descent = (ortools.solve(instance, 20.0, 0, search) for search in ("first", "greedy_descent"))
@@ -82,6 +85,7 @@ def test_a_descent_is_much_better_and_always_the_same():
         assert descent == ortools.solve(instance, 20.0, 1, "greedy_descent")
 
 
+@pytest.mark.slow
 def test_guided_search_reaches_the_optimum_of_small_instances():
     for instance in [*Cell(7, 3, 2).instances(3), *Cell(8, 2, 2).instances(3)]:
         optimum = optimal_makespan(instance)

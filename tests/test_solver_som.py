@@ -36,6 +36,7 @@ def test_tiny_instances_are_solved_in_time_and_reproducibly(guided):
     assert som.solve(instance, 60.0, 1, guided, 2, 5) != som.solve(instance, 60.0, 2, guided, 2, 5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("guided", [False, True])
 def test_the_time_limit_holds_for_a_thousand_nodes(guided):
     som._compile()
@@ -96,6 +97,7 @@ def test_one_map_divides_the_cities_between_two_agents():
     assert sorted(sorted(tour[1:-1]) for tour in tours) == [list(range(1, 11)), list(range(11, 21))]
 
 
+@pytest.mark.slow
 def test_maps_beat_random_tours_and_more_of_them_are_never_worse():
     (instance,) = Cell(50, 5, 1).instances(2)
     costs = [makespan(instance, som.solve(instance, 60.0, 0, guided=False, maps=k)) for k in (1, 2, 5, 20)]

@@ -41,6 +41,7 @@ def test_both_ways_agree(monkeypatch, shape: str) -> None:
     assert length == pytest.approx(spanning_tree_length(nodes), rel=1e-12)
 
 
+@pytest.mark.slow
 @given(st.lists(st.tuples(*[st.integers(0, 8).map(lambda k: k / 8) | st.floats(0, 1)] * 2), min_size=2, max_size=30))
 @example([(0.0, 0.0), (0.0, 1e-135), (0.125, 0.0)])  # all but on a line, along which sorting by y does not lead
 @settings(max_examples=200, deadline=None)

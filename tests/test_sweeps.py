@@ -11,6 +11,7 @@ from dan_policy.heuristics import sampling_clip
 from mtsp_env import uniform
 
 
+@pytest.mark.slow
 def test_the_default_clip_is_that_of_the_size() -> None:
     instance = uniform(np.random.default_rng(0), 30, 3)
     plain = solve(instance, decode="sample", samples=4)
@@ -19,6 +20,7 @@ def test_the_default_clip_is_that_of_the_size() -> None:
         solve(instance, decode="sample", clip=0.0)
 
 
+@pytest.mark.slow
 def test_samples_differ_less_with_a_larger_clip() -> None:
     """With C = 10,000 every sample is the greedy game; with C = 0.001 samples are nearly random."""
     instance = uniform(np.random.default_rng(0), 30, 3)

@@ -58,6 +58,7 @@ def test_lengths_by_hand() -> None:
     assert makespan(instance, []) == 0.0
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(small, st.randoms(use_true_random=False))
 def test_a_tour_is_as_long_backwards(instance: Instance, random) -> None:
@@ -81,6 +82,7 @@ def instances_and_tours(draw) -> tuple[Instance, list[list[int]]]:
     return instance, [[*tour, 0] for tour in tours]
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(instances_and_tours())
 def test_valid_tours_pass_and_no_bound_is_above_them(case: tuple) -> None:
@@ -90,6 +92,7 @@ def test_valid_tours_pass_and_no_bound_is_above_them(case: tuple) -> None:
     assert lower_bound(instance) <= makespan(instance, tours) + 1e-12
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(instances_and_tours(), st.data())
 def test_a_missing_and_a_repeated_city_are_named(case: tuple, data: st.DataObject) -> None:
@@ -134,6 +137,7 @@ def test_staying_at_home_is_valid(square: Instance) -> None:
 # The bound
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(small)
 def test_no_solution_is_below_the_bound(instance: Instance) -> None:
@@ -174,6 +178,7 @@ def test_the_farthest_trip(square: Instance) -> None:
     assert farthest_trip([[3, 4], [0, 0], [3, 5]]) == 10.0
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(small)
 def test_with_an_agent_for_each_city_the_farthest_trip_is_the_optimum(instance: Instance) -> None:
@@ -185,6 +190,7 @@ def test_with_an_agent_for_each_city_the_farthest_trip_is_the_optimum(instance: 
     assert farthest_trip(instance.nodes) <= lower_bound(instance)
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(small, st.floats(0.01, 1.0))
 def test_the_bound_grows_with_the_map(instance: Instance, factor: float) -> None:

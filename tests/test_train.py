@@ -97,6 +97,7 @@ def decisions(learner):
     return decisions_with_advantage(episode, torch.randn(16))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunk", [1, 7, 50])
 def test_chunks_add_up_to_the_whole(learner, decisions, chunk):
     loss, whole = gradients(learner.network, decisions, 16, len(decisions))
@@ -167,6 +168,7 @@ def test_challenge_is_a_one_sided_paired_t_test():
     assert better(base - 1.0, base, 0.05)
 
 
+@pytest.mark.slow
 def test_the_baseline_changes_only_when_beaten_and_then_draws_a_new_test_set(monkeypatch):
     rng = np.random.default_rng(0)
     good, bad = Preferences([-20.0] + [0.0] * 7), Preferences([20.0] + [0.0] * 7)  # the bad one goes home early
@@ -236,6 +238,7 @@ def test_drawn_sizes_cover_their_ranges():
     assert sum(len(part.nodes) for part in draw_set(rng, TINY, 21)) == 21
 
 
+@pytest.mark.slow
 def test_the_policy_is_the_running_average_of_the_weights(tmp_path):
     plain, averaged = (
         ReinforceLearner(replace(TINY, out=tmp_path / str(decay), average=decay)) for decay in (0.0, 0.75)
@@ -302,6 +305,7 @@ def test_bad_configurations_are_named(kwargs, message):
         ReinforceConfig(**kwargs)
 
 
+@pytest.mark.slow
 def test_a_gradient_that_is_not_finite_changes_nothing(tmp_path, capsys, monkeypatch):
     learner = ReinforceLearner(replace(TINY, out=tmp_path))
     before = {name: weight.clone() for name, weight in learner.network.state_dict().items()}
@@ -319,6 +323,7 @@ def test_presets_follow_the_paper():
     assert (PAPER.learning_rate, PAPER.decay, PAPER.decay_every, PAPER.depot) == (1e-5, 0.96, 1024, "open")
 
 
+@pytest.mark.slow
 def test_the_command_line_trains_and_reports_bad_input(tmp_path, capsys):
     small = ["--n-nodes", "5", "6", "--batch-size", "4", "--network.embed-dim", "16", "--challenge-instances", "4",
              "--validation-instances", "4", "--out", str(tmp_path), "--no-tensorboard"]  # fmt: skip
@@ -329,6 +334,7 @@ def test_the_command_line_trains_and_reports_bad_input(tmp_path, capsys):
     assert checkpoint.read(tmp_path / "checkpoint.pt")["progress"]["step"] == 3
 
 
+@pytest.mark.slow
 def test_precision_is_a_setting():
     config = replace(TINY, precision="bfloat16")
     learner = ReinforceLearner(config)

@@ -97,6 +97,7 @@ def test_geo_across_the_date_line_and_over_the_pole(read) -> None:
 places = st.tuples(st.floats(-90, 90), st.floats(-180, 180))
 
 
+@pytest.mark.slow
 @given(st.lists(places, min_size=2, max_size=6))
 def test_projected_lengths_are_within_the_bound(points: list) -> None:
     """Never shorter than the great circle, longer by at most r / sin(r) for nodes within r of the centroid."""

@@ -73,6 +73,7 @@ def test_decisions_that_break_a_rule_are_refused() -> None:
         judge(instance, Cell("arrivals", 9, 2).rules, [unknown, *others])
 
 
+@pytest.mark.slow
 def test_networks_decide_side_by_side_as_alone() -> None:
     choose = chooser(load("joint"))
     instances = [EVERYTHING.instance(number) for number in range(6)]
@@ -133,6 +134,7 @@ def test_a_city_is_inserted_where_the_detour_is_shortest() -> None:
         assert route == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["plain", "arrivals", "breakdowns", "traffic", "team", "service", "everything"])
 def test_plan_once_plays_every_scenario_to_the_end(scenario: str) -> None:
     for n, m in ((2, 3), (9, 2), (12, 5)):

@@ -168,6 +168,7 @@ def test_a_long_name_can_be_written(tmp_path):
     assert (tmp_path / ("ü" * 127)).read_text() == "new"
 
 
+@pytest.mark.slow
 def test_what_a_killed_writer_leaves_is_removed(tmp_path):
     code = "import os; from mtsp_env.writing import atomic_write\nwith atomic_write('a') as _: os.kill(os.getpid(), 9)"
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}

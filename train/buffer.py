@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import multiprocessing
 import os
 import signal
@@ -25,6 +26,7 @@ from train.demonstrations import LEAST_GAMES, Demonstrations, as_decisions, demo
 from train.interrupts import ENDING
 from train.lessons import Lessons
 from train.plans import PLAN_KEYS, add_plans
+from train.regrets import Corrections
 from train.supervised_config import ImitateConfig
 
 BYTES_PER_WORKER = 2**28  # of a process that has imported torch, at least
@@ -77,7 +79,10 @@ class Buffer:
         demonstrations = self._demonstrations(index)
         decisions, valid = self._decisions(demonstrations)
         count = max(1, round(self.config.passes * len(valid)))
-        if isinstance(demonstrations, Lessons) and self.config.roll_in is not None:
+        if isinstance(demonstrations, Corrections):
+            rounds = [self.rng.permutation(len(valid)) for _ in range(math.ceil(self.config.passes))]
+            steps = np.concatenate(rounds)[:count]
+        elif isinstance(demonstrations, Lessons) and self.config.roll_in is not None:
             steps = self.rng.permutation(len(valid))  # all of them follow the student's part
         elif self.config.roll_in is None:
             steps = self.rng.permutation(len(valid))[:count]
@@ -90,8 +95,10 @@ class Buffer:
             self.sets.append((decisions, valid))
         self.next, self.instances = index + 1, self.instances + valid.shape[1]
 
-    def _decisions(self, demonstrations: Demonstrations | Lessons) -> tuple[TensorDictBase, Tensor]:
+    def _decisions(self, demonstrations: Demonstrations | Lessons | Corrections) -> tuple[TensorDictBase, Tensor]:
         """The set's decisions [T, B] with everything that is learnt from, and valid (T, B)."""
+        if isinstance(demonstrations, Corrections):
+            return demonstrations.decisions(self.config.device)
         if isinstance(demonstrations, Lessons):
             decisions, valid = demonstrations.decisions(self.config.device)
             return decisions if self.plans else decisions.exclude("plan"), valid
@@ -101,7 +108,7 @@ class Buffer:
         decisions, valid = as_decisions(demonstrations, keys, self.config)
         return add_plans(decisions, demonstrations), valid
 
-    def _demonstrations(self, index: int) -> Demonstrations | Lessons:
+    def _demonstrations(self, index: int) -> Demonstrations | Lessons | Corrections:
         """The set of that index. Workers are kept busy with the next sets, twice as many as there are workers."""
         if self.config.workers == 0:
             return demonstrate(self.config, index)

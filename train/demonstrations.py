@@ -2,7 +2,8 @@
 
 The teacher's own games only show what to do in states that the teacher reaches. With ``roll_in`` a student plays the
 beginning of every game, including its mistakes, and the teacher continues from there (DAgger: Ross, Gordon & Bagnell
-2011). In worlds the teacher has to plan again and again: see ``train.lessons``.
+2011). In worlds the teacher has to plan again and again: see ``train.lessons``. It can also tell the student what each
+decision costs: see ``train.regrets``.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from train.canonical import as_links, canonical
 from train.collect import autocast, draw_scenario, draw_size, environment, present, rotated
 from train.lessons import Lessons, teach
 from train.network import student
+from train.regrets import Corrections, correct
 from train.supervised_config import ImitateConfig, SupervisedConfig
 
 LEAST_GAMES, MOST_GAMES = 16, 256  # of a set
@@ -40,7 +42,7 @@ class Demonstrations(NamedTuple):
     begin: int = 0  # number of decisions of each game that the student took before the teacher's first
 
 
-def demonstrate(config: ImitateConfig, index: int) -> Demonstrations | Lessons:
+def demonstrate(config: ImitateConfig, index: int) -> Demonstrations | Lessons | Corrections:
     """The ``index``-th set of a run. It depends on ``config`` and ``index`` alone, not on the process that makes it."""
     from mtsp_env.reference import improve_batch  # imports Numba, which only the teacher needs
 
@@ -55,6 +57,8 @@ def demonstrate(config: ImitateConfig, index: int) -> Demonstrations | Lessons:
         problem = Problem(n_agents, {name: np.asarray(array) for name, array in turned.arrays.items()})
     if not problem.is_plain:
         return teach(config, rng, problem)
+    if config.labels == "regrets":
+        return correct(config, rng, problem)
     nodes = problem.nodes
     seed = int(rng.integers(2**31))
     begin = 0 if config.roll_in is None else int(rng.integers(n_nodes - 1))  # every game takes n - 1 decisions or more

@@ -75,20 +75,24 @@ class ImitationLosses(NamedTuple):
     """The losses of a batch of N decisions, and how often the network agrees with their labels."""
 
     total: Tensor  # () the weighted sum of the following three, with gradients
-    loss: Tensor  # () mean cross-entropy with the actions
+    loss: Tensor  # () mean cross-entropy with the actions, or mean divergence from the targets
     next: Tensor  # () mean cross-entropy with the other agents' next nodes; 0 without plans
     assignment: Tensor  # () mean cross-entropy with the cities' visitors; 0 without plans
-    agreed: Tensor  # () number of decisions whose action has a probability above 1/2
+    agreed: Tensor  # () number of decisions whose action, or whose target's likeliest one, has a probability above 1/2
 
 
 def imitation_losses(network: nn.Module, decisions: TensorDictBase, config: SupervisedConfig) -> ImitationLosses:
     """Cross-entropies with the ``action`` of each decision and, if the decisions have one, its ``plan``.
+
+    Decisions with a ``target`` are learnt from that alone: see ``train.regrets``.
 
     Args:
         network: a network, with ``forward_dense`` if there are plans.
         decisions: TensorDict [N] of games of one size.
         config: the weights of the losses, and how plans are matched.
     """
+    if "target" in decisions.keys():  # noqa: SIM118 (a TensorDict is no mapping)
+        return _target_losses(network, decisions)
     if "plan" in decisions.keys():  # noqa: SIM118 (a TensorDict is no mapping)
         forward_dense: Any = network.forward_dense
         logits: DenseLogits = forward_dense(*(decisions.get(key, None) for key in network_keys(network)))
@@ -104,6 +108,17 @@ def imitation_losses(network: nn.Module, decisions: TensorDictBase, config: Supe
     total = loss + config.next_weight * next_loss + config.assignment_weight * assignment_loss
     agreed = (log_prob.detach() > math.log(0.5)).sum()
     return ImitationLosses(total, loss, next_loss, assignment_loss, agreed)
+
+
+def _target_losses(network: nn.Module, decisions: TensorDictBase) -> ImitationLosses:
+    """The mean divergence of the policy from ``target`` [N, n] of each decision: 0 if it has learnt them."""
+    logits: Tensor = network(*(decisions.get(key, None) for key in network_keys(network)))
+    legal, target = decisions["action_mask"], decisions["target"]
+    log_prob = logits.float().masked_fill(~legal, -torch.inf).log_softmax(1).masked_fill(~legal, 0.0)
+    loss = (torch.special.xlogy(target, target) - target * log_prob).sum(1).mean()
+    likeliest = log_prob.detach().gather(1, target.argmax(1, keepdim=True))
+    nothing = loss.new_zeros(())
+    return ImitationLosses(loss, loss, nothing, nothing, (likeliest > math.log(0.5)).sum())
 
 
 def learns_plans(network: nn.Module, config: SupervisedConfig) -> bool:

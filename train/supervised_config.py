@@ -95,11 +95,17 @@ class ImitateConfig(SupervisedConfig):
     buffer: int = 16
     """Number of sets to draw from at a time."""
     passes: float = 1.0
-    """Share of a set's decision indices that are used before a fresh set replaces it, at most 1."""
+    """Share of a set's decision indices that are used before a fresh set replaces it, at most 1. With `labels` regrets,
+    how often each of its decisions is used."""
     roll_in: str | None = None
     """Weights of a student (a file, or a shipped model's name) that plays a random number of decisions at the beginning
     of each game; the teacher shows how to continue (DAgger), and the next decisions are learnt from, a share `passes`
     of the set's. None: the teacher plays whole games."""
+    labels: Literal["tours", "regrets"] = "tours"
+    """What is learnt: the teacher's tours, or, in whole games of the student `roll_in`, to prefer those of its likely
+    next nodes after which the teacher's tours are shortest (regrets)."""
+    regret_temperature: float = 0.01
+    """With `labels` regrets: a next node that makes the makespan longer by this share gets 1 / e of its probability."""
     sets_per_step: int = 4
     """Number of sets that an optimiser step takes decisions from."""
     teacher_iterations: int = 80
@@ -120,7 +126,19 @@ class ImitateConfig(SupervisedConfig):
             raise ValueError(f"n_nodes[0] must be above n_agents[0]={self.n_agents[0]}, got {self.n_nodes[0]}")
         if self.sets_per_step > self.buffer:
             raise ValueError(f"sets_per_step must be at most buffer={self.buffer}, got {self.sets_per_step}")
-        self._check_share("passes")
+        if self.labels not in ("tours", "regrets"):
+            raise ValueError(f"labels must be 'tours' or 'regrets', got {self.labels!r}")
+        if not 0 < self.regret_temperature < math.inf:
+            raise ValueError(f"regret_temperature must be finite and above 0, got {self.regret_temperature!r}")
+        if self.labels == "tours":
+            self._check_share("passes")
+        elif not 0 < self.passes <= 100:
+            raise ValueError(f"passes must be above 0 and at most 100, got {self.passes!r}")
+        elif self.roll_in is None or self.scenario != ("plain",) or self.plan_matching != "canonical":
+            raise ValueError(
+                "labels='regrets' needs a student in roll_in, scenario ('plain',) and plan_matching 'canonical', got "
+                f"{self.roll_in!r}, {self.scenario} and {self.plan_matching!r}"
+            )
         if self.plan_matching == "invariant" and self.scenario != ("plain",):
             raise ValueError(
                 f"plan_matching must be 'canonical' in worlds, where agents may differ, got scenario={self.scenario}"

@@ -30,11 +30,12 @@ def optimise(
     seconds: float | None,
     iterations: int | None,
     started: float,
+    temperature: float = START_TEMPERATURE,
 ) -> None:
     """Insert the cities from ``first_unvisited`` on greedily, load the tours ``start`` if they are better, and anneal.
 
     Cities that are missing in ``start`` are inserted greedily there. ``bound`` is a lower bound on the makespan, at
-    which the search ends.
+    which the search ends. The search begins at ``temperature``: the lower, the more of the first tours it keeps.
     """
     n = len(search.near)
     home = np.hypot(search.x[:n] - search.x[0], search.y[:n] - search.y[0])
@@ -60,7 +61,7 @@ def optimise(
         best += weight * float(search.length.sum())
     if seconds is None and iterations is None:
         iterations = ITERATIONS_PER_NODE * n
-    _anneal(search, best, target, weight, unit, seconds, iterations, started)
+    _anneal(search, best, target, weight, unit, seconds, iterations, started, temperature)
 
 
 def _anneal(
@@ -72,16 +73,19 @@ def _anneal(
     seconds: float | None,
     iterations: int | None,
     started: float,
+    temperature: float,
 ) -> None:
     """Anneal in rounds until ``seconds`` after ``started``, or for ``iterations``.
 
-    Temperatures are in units of ``unit``, a length; ``best``, ``target`` and ``weight`` are those of ``sisr.anneal``.
+    ``temperature`` is the first one, in units of ``unit``, a length; ``best``, ``target`` and ``weight`` are those of
+    ``sisr.anneal``.
     """
     if iterations == 0:
         return
     seconds = math.inf if seconds is None else seconds
     limit = 2**62 if iterations is None else iterations
     turn_seconds = max(seconds / 100, MIN_TURN_SECONDS)  # a kernel does not see the clock, so it is called in turns
+    last = min(temperature, END_TEMPERATURE)
     per_iteration, done, now = FIRST_GUESS + FIRST_GUESS_PER_AGENT * len(search.length), 0, time.perf_counter()
 
     def progress(now: float, done: int) -> float:  # the fraction of the search that is over
@@ -94,8 +98,7 @@ def _anneal(
             turn = int(max(min(turn, math.ceil(end * limit) - done), 1))
             turn_end = min(progress(now + turn * per_iteration, done + turn), end)
             hot, cold = (
-                START_TEMPERATURE * (END_TEMPERATURE / START_TEMPERATURE) ** ((p - begin) / (end - begin))
-                for p in (turn_begin, turn_end)
+                temperature * (last / temperature) ** ((p - begin) / (end - begin)) for p in (turn_begin, turn_end)
             )
             best = sisr.anneal(search, turn, hot * unit, cold * unit, best, target, weight)
             before, now = now, time.perf_counter()

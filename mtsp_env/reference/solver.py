@@ -20,7 +20,7 @@ from mtsp_env.checks import check_count, check_seconds
 from mtsp_env.instance import Instance, Tours, check_arrays, check_plannable
 from mtsp_env.machine import check_memory, usable_cores
 from mtsp_env.reference import sisr
-from mtsp_env.reference.annealing import optimise
+from mtsp_env.reference.annealing import START_TEMPERATURE, optimise
 from mtsp_env.reference.search import as_order, as_tours, new_search, place_agents, remaining_order
 from mtsp_env.tours import check_prefixes, check_tours, is_closed, longest_trip, makespan, tour_times
 
@@ -225,8 +225,9 @@ def _solve(
     tidy: bool = False,
     prefixes: Tours | None = None,
     stopped: Collection[int] = (),
+    temperature: float = START_TEMPERATURE,
 ) -> Tours:
-    """``improve`` without its checks."""
+    """``improve`` without its checks, from the first ``temperature`` on."""
     started = time.perf_counter()
     n, m = instance.n_nodes, instance.n_agents
     bound = longest_trip(instance)  # the other part of tours.lower_bound, the spanning tree, is never attained
@@ -234,7 +235,7 @@ def _solve(
         # At most one agent per city is of use
         search = new_search(instance.nodes, min(m, n - 1), seed, service=instance.service)
         start = None if tours is None else as_order(tours, len(search.best) - 1)
-        optimise(search, 1, start, bound, tidy, seconds, iterations, started)
+        optimise(search, 1, start, bound, tidy, seconds, iterations, started, temperature)
         return as_tours(sisr.best_order(search), m)
 
     prefixes = [[0] for _ in range(m)] if prefixes is None else prefixes
@@ -246,7 +247,8 @@ def _solve(
         routes = [tour[len(prefix) :] for tour, prefix in zip(tours, prefixes, strict=True)]
     driven = tour_times(instance, prefixes)
     bound = 0.0 if stopped else bound  # a stopped agent does not drive home from the farthest city
-    rest = _plan_rest(instance, heads, driven, unvisited, routes, bound, tidy, seconds, iterations, seed, started)
+    limits = (bound, tidy, seconds, iterations, seed, started, temperature)
+    rest = _plan_rest(instance, heads, driven, unvisited, routes, *limits)
     return [
         prefix if final[agent] else [*prefix, *route, 0]
         for agent, (prefix, route) in enumerate(zip(prefixes, rest, strict=True))
@@ -265,6 +267,7 @@ def _plan_rest(
     iterations: int | None,
     seed: int,
     started: float,
+    temperature: float = START_TEMPERATURE,
 ) -> Tours:
     """``plan_rest``, with a lower ``bound`` on the makespan, at which the search ends unless ``tidy``."""
     if not cities:
@@ -276,6 +279,6 @@ def _plan_rest(
     place_agents(search, heads, driven)
     bound = max(bound, sisr.sum_lengths(search))  # every agent must at least go home from its head
     start = None if routes is None else remaining_order(heads, routes, remaining)
-    optimise(search, 1 + len(at_cities), start, bound, tidy, seconds, iterations, started)
+    optimise(search, 1 + len(at_cities), start, bound, tidy, seconds, iterations, started, temperature)
     rest = as_tours(sisr.best_order(search), len(heads))
     return [[remaining[node] for node in tour[2 if head else 1 : -1]] for head, tour in zip(heads, rest, strict=True)]

@@ -53,6 +53,7 @@ def read(path, data):
         return None
 
 
+@pytest.mark.slow
 @given(data=st.data())
 @settings(deadline=None)
 def test_broken_bytes(path, whole, data):
@@ -61,6 +62,7 @@ def test_broken_bytes(path, whole, data):
     assert (state is not None) == (changed == whole)
 
 
+@pytest.mark.slow
 @given(data=st.data())
 @settings(deadline=None)
 def test_broken_bytes_of_an_older_file(path, without_checksum, data):
@@ -69,6 +71,7 @@ def test_broken_bytes_of_an_older_file(path, without_checksum, data):
     assert state is None or same(state, STATE)
 
 
+@pytest.mark.slow
 @given(data=st.data())
 @settings(deadline=None)
 def test_broken_content_with_a_checksum_that_fits(path, without_checksum, data):

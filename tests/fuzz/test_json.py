@@ -51,6 +51,7 @@ def check_tours(path, data):
     assert tours is None or all(type(node) is int for tour in tours for node in tour)
 
 
+@pytest.mark.slow
 @given(data=st.data())
 @settings(deadline=None)
 def test_broken_bytes(path, data):
@@ -58,12 +59,14 @@ def test_broken_bytes(path, data):
     check_tours(path, data.draw(broken(json.dumps(TOURS).encode())))
 
 
+@pytest.mark.slow
 @given(field=st.sampled_from([*INSTANCE, "speeds", "service", "appears", "breaks", "traffic"]), value=VALUES)
 @settings(deadline=None)
 def test_any_value_of_a_field(path, field, value):
     check_instance(path, json.dumps({**INSTANCE, field: value}).encode())
 
 
+@pytest.mark.slow
 @given(place=st.sampled_from([(0, 0), (2, 1)]), value=VALUES)
 @settings(deadline=None)
 def test_any_value_of_a_coordinate(path, place, value):
@@ -72,6 +75,7 @@ def test_any_value_of_a_coordinate(path, place, value):
     check_instance(path, json.dumps({**INSTANCE, "nodes": nodes}).encode())
 
 
+@pytest.mark.slow
 @given(value=VALUES)
 @settings(deadline=None)
 def test_any_value_of_the_tours(path, value):

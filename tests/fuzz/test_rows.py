@@ -46,12 +46,14 @@ def check(path, line):
         assert rows.parse(json.dumps(asdict(result))) == result
 
 
+@pytest.mark.slow
 @given(data=st.data())
 @settings(deadline=None)
 def test_broken_bytes(path, data):
     check(path, data.draw(broken(LINE)))
 
 
+@pytest.mark.slow
 @given(field=st.sampled_from([field.name for field in fields(rows.Row)]), value=VALUES)
 @settings(deadline=None)
 def test_any_value_of_a_field(path, field, value):

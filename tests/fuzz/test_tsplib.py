@@ -44,12 +44,14 @@ def read(path, data):
     assert math.isfinite(lower_bound(instance) * instance.scale)
 
 
+@pytest.mark.slow
 @given(data=st.data())
 @settings(deadline=None)
 def test_broken_bytes(path, data):
     read(path, data.draw(broken(WHOLE)))
 
 
+@pytest.mark.slow
 @given(rows=st.lists(st.tuples(PLACES, PLACES), max_size=5), kind=st.sampled_from(["EUC_2D", "CEIL_2D", "ATT", "GEO"]))
 @settings(deadline=None)
 def test_any_coordinates(path, rows, kind):

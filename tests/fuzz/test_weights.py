@@ -40,6 +40,7 @@ def read(file, data):
         return None
 
 
+@pytest.mark.slow
 @given(data=st.data())
 @settings(deadline=None)
 def test_broken_bytes(file, whole, data):
@@ -52,6 +53,7 @@ def test_broken_bytes(file, whole, data):
         assert all(map(torch.equal, network.state_dict().values(), original.state_dict().values()))
 
 
+@pytest.mark.slow
 @given(data=st.data())
 @settings(deadline=None)
 def test_broken_headers_without_a_checksum(file, whole, data):
