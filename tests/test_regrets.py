@@ -46,7 +46,15 @@ def test_probabilities_fall_by_e_for_each_temperature_of_regret():
 
 def test_a_node_that_the_student_never_takes_is_learnt_if_all_others_are_bad():
     target, _ = improved(np.array([1.0, 0.0]), np.array([1.0, 0.0]), temperature=0.002)
-    assert target[1] > 0.99  # regrets count as GREATEST_REGRET at most, 25 temperatures
+    assert target[1] > 0.99  # 25 temperatures
+
+
+def test_regrets_have_a_greatest_value():
+    """The temperature is so low that the largest regrets would leave nothing of a probability otherwise."""
+    prior = np.array([0.5, 0.5])
+    target, expected = improved(prior, np.array([1.0, 0.0]), temperature=0.05)
+    assert expected == pytest.approx(GREATEST_REGRET / 2)
+    assert target[0] == pytest.approx(1 / (1 + np.e))
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(1e-3, 1.0))
@@ -97,6 +105,19 @@ def test_regrets_of_small_games_are_exact():
                 assert regret == pytest.approx(costs[node] / min(costs[other] for other in regrets) - 1.0, abs=1e-6)
                 tried += 1
     assert tried > 50
+
+
+def test_regrets_are_relative_to_the_best_node_not_to_the_teachers_first_plan():
+    rng = np.random.default_rng(6)
+    config = replace(TINY_PLANS, labels="regrets", roll_in="joint", teacher_iterations=1)
+    instance = Instance(rng.random((30, 2)), 3)
+    cities = rng.permutation(29) + 1
+    prior = np.full((29, 30), 1 / 30)
+    prior[:, 0] = 0.0
+    for step in range(1, 29):
+        prior[step, cities[:step]] = 0.0
+    for _, regrets in game_regrets(instance, np.arange(29) % 3, cities, prior, config, seed=0):
+        assert min(regrets.values()) == 0.0 and len(regrets) > 1
 
 
 @pytest.mark.slow
