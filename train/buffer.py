@@ -7,7 +7,7 @@ import math
 import multiprocessing
 import os
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from threading import Thread
@@ -110,17 +110,25 @@ class Buffer:
 
     def _demonstrations(self, index: int) -> Demonstrations | Lessons | Corrections:
         """The set of that index. Workers are kept busy with the next sets, twice as many as there are workers."""
+        self._begin(range(index, index + 2 * self.config.workers + 1))
+        return self._end(index)
+
+    def _begin(self, indices: Iterable[int]) -> None:
+        """Let the workers, if there are any, make the sets of these indices."""
         if self.config.workers == 0:
-            return demonstrate(self.config, index)
+            return
         if self._pool is None:
             spawn = multiprocessing.get_context("spawn")  # a fork of a process with threads may hang
             with _signals_blocked():  # its resource tracker inherits that, and unblocks some of them here as it starts
                 self._pool = ProcessPoolExecutor(self.config.workers, spawn, _set_up_worker)
         with _signals_blocked():  # which workers inherit when they start: signals are for the learning process
-            for ahead in range(index, index + 2 * self.config.workers + 1):
-                if ahead not in self._pending:
-                    self._pending[ahead] = self._pool.submit(demonstrate, self.config, ahead)
-        return self._pending.pop(index).result()
+            for index in indices:
+                if index not in self._pending:
+                    self._pending[index] = self._pool.submit(demonstrate, self.config, index)
+
+    def _end(self, index: int) -> Demonstrations | Lessons | Corrections:
+        """The set of that index, once it is made."""
+        return self._pending.pop(index).result() if self.config.workers else demonstrate(self.config, index)
 
     def state_dict(self) -> dict[str, Any]:
         """Which sets are at hand, and what is left of each."""
@@ -141,8 +149,8 @@ class Buffer:
         if state["student"] != self.student:
             raise ValueError(f"roll_in={self.config.roll_in!r} holds other weights than when the run began")
         self.indices, self.left = list(state["indices"]), [list(left) for left in state["left"]]
-        self.sets = [self._decisions(self._demonstrations(index)) for index in self.indices]
-        self._pending.clear()
+        self._begin(self.indices)
+        self.sets = [self._decisions(self._end(index)) for index in self.indices]
         self.next, self.instances = state["next"], state["instances"]
 
     def close(self) -> None:
