@@ -21,7 +21,7 @@ test: $(VENV)/.dev
 coverage: $(VENV)/.dev
 	$(PYTEST) --cov --cov-report=term
 
-# The quick tests alone, on all cores: two and a half minutes on two slow cores.
+# The quick tests alone, on all cores: about a minute on two slow cores.
 test-fast: $(VENV)/.dev
 	$(PYTEST) -m "not slow and not gpu"
 
