@@ -1,54 +1,18 @@
 """The reference solver with agents under way: it finds the best completions and keeps the given beginnings."""
 
-import itertools
-
 import numpy as np
 import pytest
 import torch
+from helpers.completions import least_makespan, teams_under_way
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mtsp_env import Instance, check_tours, makespan, rules
 from mtsp_env.batched import BatchedMTSP
-from mtsp_env.instance import Tours
 from mtsp_env.tours import path_lengths
 
 pytest.importorskip("numba", reason="needs the extra reference")
 from mtsp_env.reference import improve, improve_batch
-
-points = st.tuples(*[st.integers(0, 3).map(lambda k: k / 3) | st.floats(0, 1)] * 2)  # many coincide
-
-
-@st.composite
-def teams_under_way(draw: st.DrawFn, max_nodes: int = 12) -> tuple[Instance, Tours, Tours]:
-    """An instance, prefixes of its tours, some of them closed, and tours that begin with them."""
-    instance = Instance(draw(st.lists(points, min_size=2, max_size=max_nodes)), draw(st.integers(1, 5)))
-    tours: Tours = [[0] for _ in range(instance.n_agents)]
-    for city in draw(st.permutations(range(1, instance.n_nodes))):
-        tours[draw(st.integers(0, instance.n_agents - 1))].append(city)
-    prefixes = [tour[: draw(st.integers(1, len(tour)))] for tour in tours]
-    tours = [[*tour, 0] for tour in tours]
-    for agent, tour in enumerate(tours):
-        if tour == [*prefixes[agent], 0] and draw(st.booleans()):
-            prefixes[agent] = tour
-    unvisited = set(range(instance.n_nodes)).difference(*prefixes)
-    if unvisited and all(len(prefix) > 1 and prefix[-1] == 0 for prefix in prefixes):
-        prefixes[0] = [0]
-    return instance, prefixes, tours
-
-
-def least_makespan(instance: Instance, prefixes: Tours) -> float:
-    """The least makespan of all tours that begin with the prefixes, by trying them."""
-    unvisited = sorted(set(range(1, instance.n_nodes)).difference(*prefixes))
-    open_agents = [a for a, prefix in enumerate(prefixes) if not (len(prefix) > 1 and prefix[-1] == 0)]
-    best = np.inf
-    for order in itertools.permutations(unvisited):
-        for agents in itertools.combinations_with_replacement(open_agents, len(order)):
-            tours = [list(prefix) for prefix in prefixes]
-            for city, agent in zip(order, agents, strict=True):
-                tours[agent].append(city)
-            best = min(best, makespan(instance, [[*tour, 0] for tour in tours]))
-    return best
 
 
 @pytest.mark.slow

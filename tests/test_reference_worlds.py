@@ -1,10 +1,10 @@
 """The reference solver in worlds with speeds and service, and around agents that have stopped."""
 
-import itertools
 import math
 
 import numpy as np
 import pytest
+from helpers.completions import least_makespan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -52,21 +52,6 @@ def teams_under_way(
     return instance, prefixes, tours, stopped
 
 
-def least_makespan(instance: Instance, prefixes: Tours, stopped: set[int]) -> float:
-    """The least makespan of all tours that begin with the prefixes, by trying every assignment and every order."""
-    unvisited = sorted(set(range(1, instance.n_nodes)).difference(*prefixes))
-    going = [a for a, prefix in enumerate(prefixes) if a not in stopped and not is_closed(prefix)]
-    best = math.inf
-    for order in itertools.permutations(unvisited):
-        for agents in itertools.combinations_with_replacement(going, len(order)):
-            tours = [list(prefix) for prefix in prefixes]
-            for city, agent in zip(order, agents, strict=True):
-                tours[agent].append(city)
-            closed = [tour if agent in stopped else [*tour, 0] for agent, tour in enumerate(tours)]
-            best = min(best, makespan(instance, closed))
-    return best
-
-
 def check_kept(instance: Instance, prefixes: Tours, tours: Tours, stopped: set[int]) -> None:
     """The tours solve the instance and begin with the prefixes; those of finished agents are the prefixes."""
     check_tours(instance, [[*tour, 0] if agent in stopped else tour for agent, tour in enumerate(tours)])
@@ -81,7 +66,7 @@ def check_kept(instance: Instance, prefixes: Tours, tours: Tours, stopped: set[i
 def test_small_instances_are_solved_to_the_optimum(instance: Instance) -> None:
     tours = improve(instance, iterations=20_000)  # if speeds differ by a factor of 30, 2,000 may not suffice
     check_tours(instance, tours)
-    least = least_makespan(instance, [[0] for _ in range(instance.n_agents)], set())
+    least = least_makespan(instance, [[0] for _ in range(instance.n_agents)])
     assert makespan(instance, tours) == pytest.approx(least, abs=1e-9)
 
 

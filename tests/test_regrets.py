@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from helpers.completions import choices_of, decided, least_makespan
 from helpers.states import same
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_choices import choices_of, decided
-from test_prefixes import least_makespan
 from tiny import TINY, TINY_PLANS, interrupt_after
 
 from dan_policy import DAN, JointDAN, load, save
@@ -19,8 +18,7 @@ from train.buffer import Buffer
 from train.demonstrations import demonstrate
 from train.imitate import ImitationLearner, imitate
 from train.network import make_network
-from train.regrets import GREATEST_REGRET, Corrections, improved
-from train.regrets import _game_regrets as game_regrets
+from train.regrets import GREATEST_REGRET, Corrections, game_regrets, improved
 from train.supervised import imitation_losses
 
 pytest.importorskip("numba", reason="the teacher is compiled with Numba")
@@ -50,7 +48,7 @@ def test_a_node_that_the_student_never_takes_is_learnt_if_all_others_are_bad():
 
 
 def test_regrets_have_a_greatest_value():
-    """The temperature is so low that the largest regrets would leave nothing of a probability otherwise."""
+    """Larger regrets count as the greatest one: both in what the student expects and in its target."""
     prior = np.array([0.5, 0.5])
     target, expected = improved(prior, np.array([1.0, 0.0]), temperature=0.05)
     assert expected == pytest.approx(GREATEST_REGRET / 2)
@@ -78,7 +76,6 @@ def test_targets_are_probabilities_and_lose_no_more_than_the_student(seed, tempe
 def test_regrets_of_small_games_are_exact():
     """Along a random game, the regret of each node is how much longer the best tours after it are than the best."""
     rng = np.random.default_rng(5)
-    config = replace(TINY_PLANS, labels="regrets", roll_in="joint", teacher_iterations=1000)
     tried = 0
     for _ in range(8):
         instance = Instance(rng.random((6, 2)), 2)
@@ -90,34 +87,43 @@ def test_regrets_of_small_games_are_exact():
             deciders.append(agent)
             chosen.append(node)
             prefixes[agent].append(node)
-        everything = np.array(
-            [
-                [node in choices_of(instance, *state) for node in range(6)]
-                for state in zip(states, deciders, strict=True)
-            ]
-        )
-        for step, regrets in game_regrets(
-            instance, np.array(deciders), np.array(chosen), everything / 6.0, config, seed=0
-        ):
-            legal = choices_of(instance, states[step], deciders[step])
-            costs = {node: least_makespan(instance, decided(states[step], deciders[step], node)) for node in legal}
+        turns = zip(states, deciders, strict=True)
+        legal = np.array([[node in choices_of(instance, *turn) for node in range(6)] for turn in turns])
+        game = (np.array(deciders), legal, legal / 6.0, np.array(chosen))  # everything is likely
+        for step, regrets in game_regrets(instance, *game, teacher_iterations=1000, seed=0):
+            nodes = choices_of(instance, states[step], deciders[step])
+            costs = {node: least_makespan(instance, decided(states[step], deciders[step], node)) for node in nodes}
             for node, regret in regrets.items():
                 assert regret == pytest.approx(costs[node] / min(costs[other] for other in regrets) - 1.0, abs=1e-6)
                 tried += 1
     assert tried > 50
 
 
+def random_game(seed: int, n_nodes: int, n_agents: int) -> tuple[Instance, tuple[np.ndarray, ...]]:
+    """An instance, and a game in which agents take turns to go to random cities; every city looks likely."""
+    rng = np.random.default_rng(seed)
+    cities = rng.permutation(n_nodes - 1) + 1
+    legal = np.ones((n_nodes - 1, n_nodes), bool)
+    legal[:, 0] = False
+    for step in range(1, n_nodes - 1):
+        legal[step, cities[:step]] = False
+    deciders = np.arange(n_nodes - 1) % n_agents
+    return Instance(rng.random((n_nodes, 2)), n_agents), (deciders, legal, legal / n_nodes, cities)
+
+
 def test_regrets_are_relative_to_the_best_node_not_to_the_teachers_first_plan():
-    rng = np.random.default_rng(6)
-    config = replace(TINY_PLANS, labels="regrets", roll_in="joint", teacher_iterations=1)
-    instance = Instance(rng.random((30, 2)), 3)
-    cities = rng.permutation(29) + 1
-    prior = np.full((29, 30), 1 / 30)
-    prior[:, 0] = 0.0
-    for step in range(1, 29):
-        prior[step, cities[:step]] = 0.0
-    for _, regrets in game_regrets(instance, np.arange(29) % 3, cities, prior, config, seed=0):
+    instance, game = random_game(6, n_nodes=30, n_agents=3)
+    for _, regrets in game_regrets(instance, *game, teacher_iterations=1, seed=0):
         assert min(regrets.values()) == 0.0 and len(regrets) > 1
+
+
+def test_only_legal_nodes_are_tried_even_if_the_teacher_would_leave_an_agent_at_home():
+    """Two agents take what the third should have visited, which must visit a city nevertheless."""
+    for seed in range(5):
+        instance, (_, legal, *game) = random_game(seed, n_nodes=8, n_agents=3)
+        deciders = np.array([0, 1, 0, 1, 0, 1, 2])
+        steps = list(game_regrets(instance, deciders, legal, *game, teacher_iterations=20, seed=0))
+        assert len(steps) >= 5 and all(legal[step, list(regrets)].all() for step, regrets in steps)
 
 
 @pytest.mark.slow

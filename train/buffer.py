@@ -97,9 +97,7 @@ class Buffer:
 
     def _decisions(self, demonstrations: Demonstrations | Lessons | Corrections) -> tuple[TensorDictBase, Tensor]:
         """The set's decisions [T, B] with everything that is learnt from, and valid (T, B)."""
-        if isinstance(demonstrations, Corrections):
-            return demonstrations.decisions(self.config.device)
-        if isinstance(demonstrations, Lessons):
+        if isinstance(demonstrations, (Lessons, Corrections)):
             decisions, valid = demonstrations.decisions(self.config.device)
             return decisions if self.plans else decisions.exclude("plan"), valid
         if not self.plans:

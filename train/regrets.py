@@ -29,7 +29,7 @@ from train.network import student
 from train.supervised_config import ImitateConfig
 
 LIKELY = 0.02  # nodes with at least this probability are tried,
-MOST_TRIED = 5  # but not more than so many, and always the one that the teacher's own tours lead to
+MOST_TRIED = 5  # but not more than so many; those to which the student and the teacher's own tours go are always
 GREATEST_REGRET = 0.05  # relative to the makespan; larger ones count as this
 LEAST_LOSS = 0.001  # expected regret from which a decision is worth learning from
 LEAST_PROBABILITY = 1e-6  # of a node that is tried, so that the student can learn to go where it would never go
@@ -55,8 +55,8 @@ class Corrections(NamedTuple):
 def correct(config: ImitateConfig, rng: np.random.Generator, problem: Problem) -> Corrections:
     """Whole games that the student plays greedily, and what their decisions cost.
 
-    Kept are all decisions in which the student's expected regret is ``LEAST_LOSS`` or more, and as many others, drawn
-    at random, from which it learns to go on as before.
+    Kept are all decisions in which the student's expected regret is ``LEAST_LOSS`` or more, and as many others, at
+    least one for each instance in the mean. They are drawn at random, and teach it to go on as before.
 
     Args:
         config: the run's options; ``roll_in`` names the student.
@@ -68,8 +68,9 @@ def correct(config: ImitateConfig, rng: np.random.Generator, problem: Problem) -
     for row, seed in enumerate(rng.integers(2**31, size=len(problem.nodes)).tolist()):
         instance = Instance(np.asarray(problem.nodes[row]), problem.n_agents)
         length = int(valid[:, row].sum())
-        game = (observation["agent"][:length, row], chosen[:length, row], prior[:length, row])
-        for step, known in _game_regrets(instance, *game, config, seed):
+        seen = (observation["agent"], observation["action_mask"], prior, chosen)
+        game = (array[:length, row] for array in seen)
+        for step, known in game_regrets(instance, *game, config.teacher_iterations, seed):
             regret[step, row, list(known)] = list(known.values())
     target, expected = improved(prior, regret, config.regret_temperature)
 
@@ -101,7 +102,7 @@ def improved(prior: np.ndarray, regret: np.ndarray, temperature: float) -> tuple
     weight = np.where(known, np.maximum(prior, LEAST_PROBABILITY) * np.exp(-cost / temperature), 0.0)
     total = weight.sum(-1, keepdims=True)
     target = np.where(known, weight * (mass / np.where(total > 0.0, total, 1.0)), prior)
-    expected = (share * cost).sum(-1) / np.maximum(mass[..., 0], LEAST_PROBABILITY)
+    expected = (share * cost).sum(-1) / np.where(mass > 0.0, mass, 1.0)[..., 0]
     return target.astype(np.float32), expected
 
 
@@ -119,29 +120,41 @@ def _play(config: ImitateConfig, problem: Problem) -> tuple[dict[str, np.ndarray
     return observation, logits.softmax(-1).numpy(), decisions["action"].numpy(), episode.valid.numpy()
 
 
-def _game_regrets(
-    instance: Instance, deciders: np.ndarray, chosen: np.ndarray, prior: np.ndarray, config: ImitateConfig, seed: int
+def game_regrets(
+    instance: Instance,
+    deciders: np.ndarray,
+    legal: np.ndarray,
+    prior: np.ndarray,
+    chosen: np.ndarray,
+    teacher_iterations: int,
+    seed: int,
 ) -> Iterator[tuple[int, dict[int, float]]]:
     """Step by step through one game, the regret of each node that is tried; steps at which only one is are left out.
 
     The teacher's tours are kept from step to step: they go on as those for the node that the student has chosen.
 
     Args:
-        deciders, chosen: (T,), the deciding agents and the nodes they went to.
+        instance: the problem.
+        deciders: (T,), the agent that takes each decision.
+        legal: (T, n) bool, its action mask.
         prior: (T, n), the student's probabilities.
+        chosen: (T,), the node that it went to.
+        teacher_iterations: iterations of the first search, per node.
+        seed: seed of all searches.
     """
     from mtsp_env.reference import improve, tours_after  # imports Numba, which only the teacher needs
 
     prefixes: Tours = [[0] for _ in range(instance.n_agents)]
-    iterations = config.teacher_iterations * instance.n_nodes
-    tours = improve(instance, iterations=iterations, seed=seed, prefixes=prefixes)
+    tours = improve(instance, iterations=teacher_iterations * instance.n_nodes, seed=seed, prefixes=prefixes)
     left = instance.n_nodes - 1
     for step, (agent, node) in enumerate(zip(deciders.tolist(), chosen.tolist(), strict=True)):
         if left == 0:  # everybody goes home
             return
         likely = np.argsort(-prior[step])[:MOST_TRIED]
-        planned = tours[agent][len(prefixes[agent])] if len(tours[agent]) > len(prefixes[agent]) else 0
+        planned = tours[agent][len(prefixes[agent])]
         tried = list(dict.fromkeys([planned, node, *likely[prior[step, likely] >= LIKELY].tolist()]))
+        if not legal[step, planned]:  # the teacher may leave an agent at home, which must visit a city
+            tried.remove(planned)
         after = dict(zip(tried, tours_after(instance, prefixes, agent, tried, tours, seed=seed), strict=True))
         if len(tried) > 1:
             costs = {other: makespan(instance, solution) for other, solution in after.items()}

@@ -100,12 +100,13 @@ class ImitateConfig(SupervisedConfig):
     roll_in: str | None = None
     """Weights of a student (a file, or a shipped model's name) that plays a random number of decisions at the beginning
     of each game; the teacher shows how to continue (DAgger), and the next decisions are learnt from, a share `passes`
-    of the set's. None: the teacher plays whole games."""
+    of the set's. With `labels` regrets, the student plays whole games. None: the teacher plays whole games."""
     labels: Literal["tours", "regrets"] = "tours"
-    """What is learnt: the teacher's tours, or, in whole games of the student `roll_in`, to prefer those of its likely
-    next nodes after which the teacher's tours are shortest (regrets)."""
+    """What is learnt: the teacher's tours; or how much each of the student's likely next nodes costs in its own games,
+    as the teacher sees it (regrets)."""
     regret_temperature: float = 0.01
-    """With `labels` regrets: a next node that makes the makespan longer by this share gets 1 / e of its probability."""
+    """With `labels` regrets: a node whose makespan exceeds that of the best node by this share should lose a factor of
+    e in probability, compared with the best one."""
     sets_per_step: int = 4
     """Number of sets that an optimiser step takes decisions from."""
     teacher_iterations: int = 80

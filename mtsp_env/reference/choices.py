@@ -6,14 +6,13 @@ from collections.abc import Iterator, Sequence
 
 from mtsp_env.checks import check_count
 from mtsp_env.instance import Instance, Tours
+from mtsp_env.reference.sisr import TOTAL_WEIGHT
 from mtsp_env.reference.solver import _check_search, _solve, compile_kernels
 from mtsp_env.tours import check_prefixes, check_tours, is_closed, path_lengths
 
-# Tours that already are near-optimal but for one decision are only repaired. Independent searches would differ by more
-# than most decisions cost.
+# But for one decision, the tours are near-optimal already: a search that begins hotter would lose what they are like.
 REPAIR_TEMPERATURE = 0.01
 REPAIR_ITERATIONS = 10  # per unvisited city
-TOTAL_WEIGHT = 0.01  # of the total length, relative to the makespan, when first tours are compared
 
 
 def tours_after(
@@ -27,8 +26,8 @@ def tours_after(
 ) -> list[Tours]:
     """Near-optimal tours of a team under way if ``agent`` goes to one of ``nodes`` next, for each of them.
 
-    The difference between two of their makespans is what one decision costs more than the other. To make it exact, all
-    searches begin with ``tours``, which are changed no more than the decision requires, and then repaired.
+    The difference between two of their makespans says how much more one decision costs than the other. Independent
+    searches would differ by chance. Here, each search begins with ``tours``, which it only adapts to the decision.
 
     Args:
         instance: a plain problem.
@@ -40,7 +39,8 @@ def tours_after(
         seed: a whole number of at least 0, the same for every search.
 
     Returns:
-        The tours for each of the nodes, in the same order. For the node to which ``tours`` lead, they are ``tours``.
+        The tours for each of the nodes, in the same order. For the node to which ``tours`` lead, they are ``tours``
+        without visits to the depot in the middle.
 
     Raises:
         ValueError: a problem that is not plain, tours that do not solve it or do not begin with the prefixes, a node to
@@ -51,7 +51,7 @@ def tours_after(
     _check_search(iterations, seed)
     begun = check_prefixes(instance, prefixes)
     check_tours(instance, tours)
-    base = [[int(node) for node in tour] for tour in tours]
+    base = [[0, *(int(node) for node in tour if node != 0), 0] for tour in tours]
     for number, (tour, prefix) in enumerate(zip(base, begun, strict=True)):
         if tour[: len(prefix)] != prefix or (is_closed(prefix) and tour != prefix):
             raise ValueError(f"tour {number} must begin with its prefix {prefix}, got {tour}")
@@ -66,7 +66,7 @@ def tours_after(
             raise ValueError(f"agent {agent} must go to an unvisited city, or home if others are out, got {node}")
     compile_kernels()
     iterations = REPAIR_ITERATIONS * left if iterations is None else iterations
-    planned = base[agent][len(begun[agent])] if len(base[agent]) > len(begun[agent]) else 0
+    planned = base[agent][len(begun[agent])]
     solutions = []
     for node in nodes:
         if node == planned:
