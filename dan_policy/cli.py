@@ -105,6 +105,7 @@ def solve(
     decode: Annotated[Literal["greedy", "sample"] | None, arg(metavar="{greedy,sample}"), default("greedy")] = None,
     samples: Annotated[int | None, whole(1, "K"), default(str(DEFAULT_SAMPLES))] = None,
     augment: Annotated[bool, default("off")] = False,
+    reconstruct: Annotated[int | None, whole(0, "ROUNDS"), default("0")] = None,
     device: Annotated[str | None, arg(metavar="DEVICE"), default("cpu")] = None,
     precision: Annotated[
         Literal["auto", "float32", "bfloat16"] | None, arg(metavar="{auto,float32,bfloat16}"), default("auto")
@@ -138,6 +139,7 @@ def solve(
         decode: greedy plays the likeliest actions once, sample takes the best of several games of drawn actions
         samples: with --decode sample: number of games
         augment: play in the eight symmetries of the square and take the best (greedy: eight games instead of one)
+        reconstruct: rounds in which the policy plans parts of the best tours again
         device: cpu, cuda, cuda:1, ...
         precision: the network's precision; auto takes bfloat16 if that is faster
         view: agents see at most this many cities, the nearest unvisited ones
@@ -156,6 +158,7 @@ def solve(
             "decode": decode,
             "samples": samples,
             "augment": augment,
+            "reconstruct": reconstruct,
             "device": device,
             "precision": precision,
             "view": view,
@@ -214,6 +217,7 @@ def _dan(
     network: str | None,
     decode: Literal["greedy", "sample"] | None,
     samples: int | None,
+    reconstruct: int | None,
     device: str | None,
     precision: Literal["auto", "float32", "bfloat16"] | None,
     **options: Any,
@@ -236,6 +240,7 @@ def _dan(
             policy=player,
             decode=decode or "greedy",
             samples=samples or DEFAULT_SAMPLES,
+            reconstruct=reconstruct or 0,
             seed=seed,
             device=device or "cpu",
             precision=precision or "auto",

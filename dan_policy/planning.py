@@ -12,6 +12,7 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, Literal, get_args
 
+import numpy as np
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
@@ -20,6 +21,7 @@ from dan_policy.actor import Network
 from dan_policy.episode import Decode, find_device
 from dan_policy.games import begin, best_tours, play
 from dan_policy.heuristics import bfloat16_pays, default_view, sampling_clip
+from dan_policy.reconstruct import GAMES, reconstruct
 from dan_policy.registry import find, load, network_name
 from dan_policy.symmetry import SYMMETRIES
 from mtsp_env import rules
@@ -42,7 +44,8 @@ class Solution:
         tours: one per agent, each from depot to depot.
         makespan: the longest tour, in unit-square units; times ``instance.scale`` it is in the source's.
         seconds: wall-clock time of the planning, improvement included, without loading weights or compiling kernels.
-        method: for tables, e.g. "dan(g.)", "dan(s.64)", "dan(g.x8)" (augmented) or "dan(g.)+improve(1 s)".
+        method: for tables, e.g. "dan(g.)", "dan(s.64)", "dan(g.x8)" (augmented), "dan(g.x8)+reconstruct(16)" or
+            "dan(g.)+improve(1 s)".
     """
 
     tours: Tours
@@ -61,8 +64,10 @@ class SolveOptions:
         samples: games to sample, at least 1.
         augment: the games see the instance in the square's eight symmetries in turn, and the best counts (Kwon et al.
             2020, POMO): "greedy" plays eight games instead of one, "sample" as many as without.
-        seed: seed of the samples and of the improvement, from 0 to 2^63 - 1. The same call gives the same tours on the
-            same machine, except with ``improve``, which goes by the clock.
+        reconstruct: rounds in which the policy plans parts of the best tours again (``dan_policy.reconstruct``); it
+            never makes them worse. 0 leaves them as they are.
+        seed: seed of the samples, of the re-construction and of the improvement, from 0 to 2^63 - 1. The same call
+            gives the same tours on the same machine, except with ``improve``, which goes by the clock.
         device: None takes a GPU if there is one.
         improve: seconds, above 0, for which ``mtsp_env.reference.improve`` continues from the policy's tours; it never
             makes them worse (extra ``reference``). None leaves the tours as they are.
@@ -83,6 +88,7 @@ class SolveOptions:
     decode: Decode = "greedy"
     samples: int = 64
     augment: bool = False
+    reconstruct: int = 0
     seed: int = 0
     device: torch.device | str | None = None
     improve: float | None = None
@@ -96,6 +102,7 @@ class SolveOptions:
             if getattr(self, name) not in choices:
                 raise ValueError(f"unknown {name} {getattr(self, name)!r}; choose from {list(choices)}")
         check_count("samples", self.samples, minimum=1)
+        check_count("reconstruct", self.reconstruct, minimum=0)
         check_count("seed", self.seed, minimum=0)
         if self.seed >= 2**63:
             raise ValueError(f"seed must be below 2^63, got {self.seed}")
@@ -148,7 +155,7 @@ def solve(
     check_memory("n_agents", instance.n_agents, BYTES_PER_AGENT)
     begun = [] if prefixes is None else check_prefixes(instance, prefixes)
     team = instance if begun else without_spare_agents(instance)
-    check_memory("samples", options.games, BYTES_PER_GAME_AND_NODE * (instance.n_nodes + team.n_agents))
+    check_memory("samples", max(options.games, GAMES), BYTES_PER_GAME_AND_NODE * (instance.n_nodes + team.n_agents))
     improve = _improvement(options, begun, instance)
     device = find_device(options.device)
     named = isinstance(policy, (str, os.PathLike))  # a network that is nobody else's
@@ -159,8 +166,12 @@ def solve(
     start = time.perf_counter()
     game = rules.make_rules(instance.n_nodes, team.n_agents, SPEED, "final", "sparse", None)
     state = begin(team, game, begun, options.games, options.augment, device)
-    with torch.inference_mode(named), _autocast(policy, options, instance.n_nodes, device):
-        tours = best_tours(play(policy, state, game, generator))
+    with torch.inference_mode(named):
+        with _autocast(policy, options, options.games, instance.n_nodes, device):
+            tours = best_tours(play(policy, state, game, generator))
+        with _autocast(policy, options, GAMES, instance.n_nodes, device):
+            rng = np.random.default_rng(options.seed)
+            tours = reconstruct(team, tours, policy, SPEED, options.reconstruct, rng, begun, device)
     tours = improve(instance, tours + [[0, 0] for _ in range(instance.n_agents - team.n_agents)])
     seconds = time.perf_counter() - start
 
@@ -246,17 +257,21 @@ def _configured(policy: Any, options: SolveOptions, n_nodes: int) -> Any:
     return policy
 
 
-def _autocast(policy: Any, options: SolveOptions, n_nodes: int, device: torch.device) -> torch.autocast:
-    """The precision as a context. It caches no weights: PyTorch's cache of them is shared by all threads."""
+def _autocast(policy: Any, options: SolveOptions, games: int, n_nodes: int, device: torch.device) -> torch.autocast:
+    """The precision for so many games side by side, as a context.
+
+    It caches no weights: PyTorch's cache of them is shared by all threads.
+    """
     view = getattr(getattr(policy, "config", None), "view", None) or n_nodes
     use_bfloat16 = options.precision == "bfloat16"
     if options.precision == "auto" and getattr(policy, "supports_bfloat16", False):
-        use_bfloat16 = bfloat16_pays(device, options.games * min(n_nodes, 1 + view))
+        use_bfloat16 = bfloat16_pays(device, games * min(n_nodes, 1 + view))
     return torch.autocast(device.type, torch.bfloat16, enabled=use_bfloat16, cache_enabled=False)
 
 
 def _decoding(options: SolveOptions) -> str:
     """In the paper's notation: (g.), (s.64); with "x8" if augmented."""
     decode = "g." if options.decode == "greedy" else f"s.{options.samples}"
+    reconstruct = f"+reconstruct({options.reconstruct})" if options.reconstruct else ""
     improve = "" if options.improve is None else f"+improve({options.improve:g} s)"
-    return f"({decode}{'x8' if options.augment else ''}){improve}"
+    return f"({decode}{'x8' if options.augment else ''}){reconstruct}{improve}"

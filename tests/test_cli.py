@@ -80,13 +80,14 @@ def test_json_is_the_judges_verdict_in_the_units_of_the_file(folder, solver, cap
             "precision": "auto",
             "view": None,
             "augment": False,
+            "reconstruct": 0,
         }
     ]  # the defaults that --help names
 
 
 def test_options_reach_the_solver(folder, solver) -> None:
     options = "--policy a.safetensors --decode sample --samples 7 --seed 5 --device cuda:1 --improve .5 --json"
-    options += " --precision float32 --augment --view 30"
+    options += " --precision float32 --augment --reconstruct 3 --view 30"
     assert main(["solve", "square.json", *options.split()]) == 0
     assert solver.calls == [
         {
@@ -99,6 +100,7 @@ def test_options_reach_the_solver(folder, solver) -> None:
             "precision": "float32",
             "view": 30,
             "augment": True,
+            "reconstruct": 3,
         }
     ]
 

@@ -173,6 +173,7 @@ def test_the_callers_network_stays_as_it_is():
 CALLS = [
     {"decode": "greedy"},
     {"decode": "greedy", "augment": True},
+    {"reconstruct": 3, "seed": 5},
     {"decode": "sample", "samples": 6, "seed": 1},
     {"decode": "sample", "samples": 5, "seed": 2, "augment": True},
     {"decode": "sample", "samples": 8, "seed": 3, "precision": "bfloat16"},
@@ -197,7 +198,7 @@ def process_state():
 
 @pytest.mark.slow
 def test_eight_threads_plan_what_one_does_and_change_nothing(network):
-    """Sampling, augmentation and greedy games, shipped weights, networks, actors and functions, all at once."""
+    """Every way to search and greedy games, shipped weights, networks, actors and functions, all at once."""
     instances = [uniform(np.random.default_rng(k), 12 + k, 3) for k in range(3)]
     policies = ["default", network, Own(), own_function, make_actor(own_function), make_actor(network)]
     calls = [(instance, policy, call) for instance in instances for policy in policies for call in CALLS]

@@ -1,7 +1,8 @@
-"""The effects of the clip C and of the view, and the tables of both sweeps."""
+"""The effects of the clip C and of the view, and the tables of all sweeps."""
 
 import numpy as np
 import pytest
+import torch
 
 from benchmarks.__main__ import main
 from benchmarks.studies import sweeps
@@ -60,3 +61,20 @@ def test_the_table_compares_with_seeing_everything(tmp_path) -> None:
     assert [row[3] == "–" for row in rows] == [True, True, False, False]
     plans = [solve(one, view=50) for one in Cell(120, 4, 2).instances(sweeps.SEED)]
     assert float(rows[3][2]) == pytest.approx(np.mean([plan.makespan for plan in plans]), abs=1e-4)
+
+
+@pytest.mark.slow
+def test_the_table_compares_ways_to_search_on_one_thread(tmp_path, monkeypatch) -> None:
+    """The symmetries and the rounds never make tours longer, and the number of threads stays as it was."""
+    threads, used, out = torch.get_num_threads(), set(), tmp_path / "search.md"
+    plan = sweeps.solve
+    monkeypatch.setattr(sweeps, "solve", lambda *args, **more: used.add(torch.get_num_threads()) or plan(*args, **more))
+    options = ["--sizes", "15x3", "--instances", "2", "--samples", "3", "--rounds", "2", "5", "--out", str(out)]
+    assert main(["sweep-search", *options]) == 0
+    rows = [line.strip("| ").split(" | ") for line in out.read_text().splitlines() if line.startswith("| 15")]
+    assert [row[1] for row in rows] == [
+        *("greedy", "greedy x8", "best of 3 samples", "greedy x8, 2 rounds", "greedy x8, 5 rounds")
+    ]
+    greedy, symmetric, _, few, many = (float(row[2]) for row in rows)
+    assert greedy >= symmetric >= few >= many
+    assert used == {1} and torch.get_num_threads() == threads

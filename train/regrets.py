@@ -28,7 +28,7 @@ from train.collect import autocast, environment
 from train.network import student
 from train.supervised_config import ImitateConfig
 
-LIKELY = 0.02  # nodes with at least this probability are tried,
+LIKELY = 0.05  # nodes with at least this probability are tried,
 MOST_TRIED = 5  # but not more than so many; those to which the student and the teacher's own tours go are always
 GREATEST_REGRET = 0.05  # relative to the makespan; larger ones count as this
 LEAST_LOSS = 0.001  # expected regret from which a decision is worth learning from

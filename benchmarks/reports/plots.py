@@ -29,6 +29,7 @@ STYLE = {
     "joint-greedy": ("#fb6a4a", "H"),
     "joint-greedy-x8": ("#fb6a4a", "8"),
     "joint-s64": ("#a50f15", "H"),
+    "joint-r16": ("#67000d", "H"),
     "dan-improve": ("#8c1c13", "P"),
     "schedulenet-greedy": ("#8c6d31", "o"),
     "schedulenet-greedy-x8": ("#8c6d31", "d"),

@@ -144,6 +144,7 @@ SOLVERS: dict[str, Solver] = {
     "joint-greedy": _policy("dan", weights="joint", policy="joint"),
     "joint-greedy-x8": _policy("dan", weights="joint", policy="joint", augment=True),
     "joint-s64": _policy("dan", weights="joint", policy="joint", samples=64),
+    "joint-r16": _policy("dan", weights="joint", policy="joint", augment=True, reconstruct=16),
     "dan-improve": _policy("improved_dan", "numba", anytime=True, polishes=True, weights="default"),
     "schedulenet-greedy": _policy("schedulenet", weights="schedulenet"),
     "schedulenet-greedy-x8": _policy("schedulenet", weights="schedulenet", augment=True),
@@ -166,7 +167,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "dan": ("dan-greedy", "dan-greedy-x8", "dan-s64", "dan-s64-x8", "dan-s256", "dan-improve"),
     "schedulenet": ("schedulenet-greedy", "schedulenet-greedy-x8", "schedulenet-s64"),
     "hu": ("hu-greedy", "hu-s64"),
-    "joint": ("joint-greedy", "joint-greedy-x8", "joint-s64"),
+    "joint": ("joint-greedy", "joint-greedy-x8", "joint-s64", "joint-r16"),
     "all": tuple(SOLVERS),
 }
 

@@ -22,13 +22,15 @@ def dan(
     seed: int,
     samples: int | None = None,
     augment: bool = False,
+    reconstruct: int = 0,
     policy: str = "default",
 ) -> Tours:
     """Tours by a shipped network, greedy or the best of ``samples`` (paper, Sec. 6); ``seconds`` is ignored.
 
-    With ``augment`` the instance is solved in the eight symmetries of the square.
+    With ``augment`` the instance is solved in the eight symmetries of the square. After that, parts of the best tours
+    are planned again in ``reconstruct`` rounds.
     """
-    return _plan(policy, instance, seed, samples, augment)
+    return _plan(policy, instance, seed, samples, augment, reconstruct)
 
 
 def schedulenet(
@@ -38,8 +40,10 @@ def schedulenet(
     return _plan(_schedulenet(), instance, seed, samples, augment)
 
 
-def _plan(policy: str | nn.Module, instance: Instance, seed: int, samples: int | None, augment: bool) -> Tours:
-    options = SolveOptions(augment=augment, seed=seed, device="cpu")
+def _plan(
+    policy: str | nn.Module, instance: Instance, seed: int, samples: int | None, augment: bool, reconstruct: int = 0
+) -> Tours:
+    options = SolveOptions(augment=augment, reconstruct=reconstruct, seed=seed, device="cpu")
     if samples is None:
         return solve_with(instance, policy, options).tours
     return solve_with(instance, policy, options, decode="sample", samples=samples).tours

@@ -1,11 +1,13 @@
-"""Sweeps over what ``solve`` chooses by itself: C, the range of the logits of samples, and the cities in view."""
+"""Sweeps over options of ``solve``: C, the range of the logits of samples, the cities in view, and ways to search."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 from rich.progress import track
 from scipy.stats import sem
 
@@ -13,14 +15,16 @@ from benchmarks.files import write_text
 from benchmarks.harness.machine import describe_machine
 from benchmarks.reports.markdown import markdown_table
 from benchmarks.suite import Cell, check_instances
-from dan_policy import Solution, solve
+from dan_policy import solve
 from dan_policy.heuristics import sampling_clip
-from mtsp_env.instance import Instance
 
 RESULTS = Path(__file__).parents[1] / "results"
 SEED = 123  # not that of a test set or of training
 C_FACTORS = (1.0, 0.5, 2.0)  # in units of the C that ``solve`` uses
 VIEWS = (200, 100, 50)  # cities
+
+Options = dict[str, Any]
+"""Keywords of ``solve``."""
 
 
 def sweep_clip(
@@ -45,9 +49,6 @@ def sweep_clip(
         ValueError: fewer than 2 instances, or a bad size.
     """
 
-    def solve_with(c: float, instance: Instance, seed: int) -> Solution:
-        return solve(instance, policy, decode="sample", samples=samples, seed=seed, augment=augment, clip=c)
-
     cells = _cells(sizes, instances)
     title = f"# Samples over C: best of {samples}{' in eight symmetries' if augment else ''}"
     note = (
@@ -55,8 +56,10 @@ def sweep_clip(
         f"Made by `python -m benchmarks sweep-clip --sizes {' '.join(sizes)} --instances {instances} "
         f"--samples {samples}{' --augment' if augment else ''}`."
     )
+    common: Options = {"decode": "sample", "samples": samples, "augment": augment}
     values = [[factor * sampling_clip(10.0, cell.n_nodes, augment) for factor in C_FACTORS] for cell in cells]
-    _sweep(out, title, note, "C", cells, values, solve_with)
+    choices = [{f"{c:g}": common | {"clip": c} for c in cell_values} for cell_values in values]
+    _sweep(out, title, note, "C", cells, choices, policy)
 
 
 def sweep_view(
@@ -79,10 +82,6 @@ def sweep_view(
         ValueError: fewer than 2 instances, or a bad size.
     """
 
-    def solve_with(view: float, instance: Instance, seed: int) -> Solution:
-        decode = {"decode": "greedy"} if samples is None else {"decode": "sample", "samples": samples}
-        return solve(instance, policy, seed=seed, view=int(view), **decode)
-
     cells = _cells(sizes, instances)
     title = f"# Cities in view: {'greedy' if samples is None else f'best of {samples} samples'}"
     note = (
@@ -90,8 +89,48 @@ def sweep_view(
         f"Made by `python -m benchmarks sweep-view --sizes {' '.join(sizes)} --instances {instances}"
         f"{'' if samples is None else f' --samples {samples}'}`."
     )
+    common: Options = {} if samples is None else {"decode": "sample", "samples": samples}
     values = [[cell.n_nodes, *(view for view in VIEWS if view < cell.n_nodes)] for cell in cells]
-    _sweep(out, title, note, "cities in view", cells, values, solve_with)
+    choices = [{f"{view}": common | {"view": view} for view in cell_values} for cell_values in values]
+    _sweep(out, title, note, "cities in view", cells, choices, policy)
+
+
+def sweep_search(
+    sizes: tuple[str, ...] = ("50x5", "50x10", "100x5", "100x10", "200x10"),
+    instances: int = 12,
+    samples: tuple[int, ...] = (64, 128),
+    rounds: tuple[int, ...] = (4, 8, 16),
+    policy: str = "joint",
+    out: Path = RESULTS / "search.md",
+) -> None:
+    """Compare ways to search with a policy: symmetries, samples, and re-construction of parts; write a table.
+
+    Args:
+        sizes: sizes of the instances, such as 50x5.
+        instances: number of instances of each size, at least 2.
+        samples: numbers of samples, drawn in the eight symmetries.
+        rounds: numbers of rounds of re-construction, from the best of eight greedy games.
+        policy: a shipped model or a file of weights.
+        out: file for the table.
+
+    Raises:
+        ValueError: fewer than 2 instances, or a bad size.
+    """
+    cells = _cells(sizes, instances)
+    note = (
+        f'Seconds on one thread, median over the instances. Weights "{policy}", {describe_machine()["processor"]}. '
+        f"Made by `python -m benchmarks sweep-search --sizes {' '.join(sizes)} --instances {instances} "
+        f"--samples {' '.join(map(str, samples))} --rounds {' '.join(map(str, rounds))} --policy {policy}`."
+    )
+    ways: dict[str, Options] = {"greedy": {}, "greedy x8": {"augment": True}}
+    ways |= {f"best of {k} samples": {"decode": "sample", "samples": k, "augment": True} for k in samples}
+    ways |= {f"greedy x8, {k} rounds": {"augment": True, "reconstruct": k} for k in rounds}
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        _sweep(out, "# Search with a policy", note, "way", cells, [ways] * len(cells), policy)
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _cells(sizes: Iterable[str], instances: int) -> list[Cell]:
@@ -113,22 +152,22 @@ def _sweep(
     note: str,
     parameter: str,
     cells: list[Cell],
-    values: list[list[float]],
-    solve_with: Callable[[float, Instance, int], Solution],
+    choices: list[dict[str, Options]],
+    policy: str,
 ) -> None:
-    """Solve the instances of each cell with each of its values; differences are to the cell's first value."""
+    """Solve the instances of each cell with each of its choices; differences are to the cell's first choice."""
     lines = []
-    for cell, cell_values in zip(cells, values, strict=True):
+    for cell, cell_choices in zip(cells, choices, strict=True):
         first = None
-        for value in cell_values:
-            instances = track(cell.instances(SEED), f"{cell.label}, {parameter} {value:g}", transient=True)
-            solutions = [solve_with(value, instance, i) for i, instance in enumerate(instances)]
+        for name, options in cell_choices.items():
+            instances = track(cell.instances(SEED), f"{cell.label}, {parameter} {name}", transient=True)
+            solutions = [solve(instance, policy, seed=i, **options) for i, instance in enumerate(instances)]
             cost = np.array([solution.makespan for solution in solutions])
             seconds = np.median([solution.seconds for solution in solutions])
             first = cost if first is None else first
             change = 100 * (cost / first - 1)
             difference = "–" if first is cost else f"{change.mean():+.2f} ± {sem(change):.2f}"
-            lines.append([cell.heading, f"{value:g}", f"{cost.mean():.4f}", difference, f"{seconds:.2f}"])
+            lines.append([cell.heading, name, f"{cost.mean():.4f}", difference, f"{seconds:.2f}"])
     table = markdown_table(["n, m", parameter, "makespan", "difference, %", "seconds"], lines)
     text = (
         f"{title}\n\nMean makespan over {cells[0].count} uniform instances of seed {SEED}, which is neither that of a "

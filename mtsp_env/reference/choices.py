@@ -12,7 +12,7 @@ from mtsp_env.tours import check_prefixes, check_tours, is_closed, path_lengths
 
 # But for one decision, the tours are near-optimal already: a search that begins hotter would lose what they are like.
 REPAIR_TEMPERATURE = 0.01
-REPAIR_ITERATIONS = 10  # per unvisited city
+REPAIR_ITERATIONS = 20  # per unvisited city
 
 
 def tours_after(
@@ -35,7 +35,7 @@ def tours_after(
         agent: who decides. It is not home for good.
         nodes: unvisited cities, or 0: the agent goes home for good.
         tours: near-optimal tours that begin with the prefixes, such as those of ``improve``.
-        iterations: limit on the iterations of each search, at least 0; by default 10 per unvisited city.
+        iterations: limit on the iterations of each search, at least 0; by default 20 per unvisited city.
         seed: a whole number of at least 0, the same for every search.
 
     Returns:
