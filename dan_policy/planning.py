@@ -155,7 +155,8 @@ def solve(
     check_memory("n_agents", instance.n_agents, BYTES_PER_AGENT)
     begun = [] if prefixes is None else check_prefixes(instance, prefixes)
     team = instance if begun else without_spare_agents(instance)
-    check_memory("samples", max(options.games, GAMES), BYTES_PER_GAME_AND_NODE * (instance.n_nodes + team.n_agents))
+    most_games = max(options.games, GAMES) if options.reconstruct else options.games
+    check_memory("samples", most_games, BYTES_PER_GAME_AND_NODE * (instance.n_nodes + team.n_agents))
     improve = _improvement(options, begun, instance)
     device = find_device(options.device)
     named = isinstance(policy, (str, os.PathLike))  # a network that is nobody else's
