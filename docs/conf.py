@@ -59,6 +59,7 @@ PAGES_OF_FILES = {
     "../benchmarks/results/clip.md": "measured/clip.md",
     "../benchmarks/results/exact.md": "measured/exact.md",
     "../benchmarks/results/reference-gaps.md": "measured/reference-gaps.md",
+    "../benchmarks/results/search.md": "measured/search.md",
     "../benchmarks/results/seed3333/report.md": "measured/seed3333.md",
     "../benchmarks/results/table1-100/report.md": "measured/table1-100.md",
     "../benchmarks/results/view.md": "measured/view.md",
