@@ -18,6 +18,7 @@ from torch import Tensor
 from dan_policy.actor import Key, Network, check_greatest, network_keys
 from dan_policy.symmetry import views
 from mtsp_env import rules
+from mtsp_env.arrays import library, locate, pick
 from mtsp_env.instance import Array, Instance, Problem, Tours, batch
 
 Logits = Callable[[rules.State, rules.Observation], Tensor]
@@ -118,6 +119,34 @@ def best_tours(state: rules.State) -> Tours:
     row = int(rules.makespan(state).argmin())
     visits, destination = (torch.as_tensor(array[row]).cpu().numpy() for array in (state.visits, state.destination))
     return rules.tours(visits, destination)
+
+
+def as_links(tours: Sequence[Tours], n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """The tours of B games as arrays.
+
+    Returns:
+        first: (B, m) int64, each agent's first city.
+        following: (B, n) int64, the node that comes after a city on its tour; 0 at the depot.
+    """
+    following = np.zeros((len(tours), n_nodes), np.int64)
+    for row, tours_of_game in zip(following, tours, strict=True):
+        for tour in tours_of_game:
+            row[tour[1:-1]] = tour[2:]
+    return np.array([[tour[1] for tour in tours_of_game] for tours_of_game in tours]), following
+
+
+def next_on_tour(first: Array, following: Array, agent: Array, destination: Array) -> Array:
+    """Where the deciding agents ``agent`` (B,) go next if they follow their tours.
+
+    Args:
+        first, following: the tours, as ``as_links`` returns them, in the library of the other arrays.
+        agent: (B,), the deciding agents.
+        destination: (B, m), where all agents are or are heading.
+    """
+    own = locate(agent, destination.shape[1])
+    here = pick(destination, own)
+    xp, _ = library(destination)
+    return xp.where(here == 0, pick(first, own), pick(following, locate(here, following.shape[1])))
 
 
 def _logits_of(policy: Network | TensorDictModuleBase) -> Logits:

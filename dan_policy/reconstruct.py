@@ -12,15 +12,16 @@ Random re-construction was proposed for a single tour by LEHD (Luo et al. 2023).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from tensordict.nn import TensorDictModuleBase
 
 from dan_policy.actor import Network
-from dan_policy.games import begin, best_tours, play
+from dan_policy.games import as_links, begin, best_tours, next_on_tour, play
 from mtsp_env import rules
-from mtsp_env.arrays import library, locate, pick
+from mtsp_env.arrays import library
 from mtsp_env.instance import FIELDS, Instance, Tours
 from mtsp_env.tours import is_closed, tour_times
 
@@ -120,8 +121,9 @@ def _plan_again(
 def _part(instance: Instance, nodes: list[int], agents: list[int]) -> Instance:
     """The instance with these nodes and agents alone."""
     rows = {"n": nodes, "m": agents}
-    arrays = {name: getattr(instance, name) for name in FIELDS if getattr(instance, name) is not None}
-    arrays = {name: array[rows[str(FIELDS[name].shape[0])]] for name, array in arrays.items()}
+    arrays: dict[str, Any] = {
+        name: array[rows[str(FIELDS[name].shape[0])]] for name, array in instance.arrays().items()
+    }
     return Instance(n_agents=len(agents), **arrays)
 
 
@@ -141,17 +143,10 @@ def _equivalent(tours: Tours, prefixes: Tours, alike: bool, rng: np.random.Gener
 
 def _follow(state: rules.State, game: rules.Rules, tours: list[Tours], decisions: int) -> rules.State:
     """The games, one for each of ``tours``, after so many decisions in which every agent follows its tour."""
-    n_nodes, n_agents = state.visited.shape[1], state.ready.shape[1]
-    following = np.zeros((len(tours), n_nodes), np.int64)
-    for row, tours_of_row in enumerate(tours):
-        for tour in tours_of_row:
-            following[row, tour[1:-1]] = tour[2:]
-    first = np.array([[tour[1] for tour in tours_of_row] for tours_of_row in tours])
     xp, on = library(state.ready)
-    first, following = xp.asarray(first, device=on), xp.asarray(following, device=on)
+    first, following = (xp.asarray(array, device=on) for array in as_links(tours, state.visited.shape[1]))
     for _ in range(decisions):
-        own = locate(rules.agent_to_decide(state), n_agents)
-        here = pick(state.destination, own)
-        action = xp.where(here == 0, pick(first, own), pick(following, locate(here, n_nodes)))
-        state = rules.depart(state, game, action)
+        state = rules.depart(
+            state, game, next_on_tour(first, following, rules.agent_to_decide(state), state.destination)
+        )
     return state

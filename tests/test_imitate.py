@@ -14,6 +14,7 @@ from tiny import TINY_PLANS, interrupt_after
 
 from dan_policy import DAN, DANConfig, load, save
 from dan_policy.episode import rollout
+from dan_policy.games import as_links
 from mtsp_env import check_tours, makespan
 from mtsp_env.instance import Instance, Problem
 from train import checkpoint
@@ -21,7 +22,7 @@ from train.__main__ import main
 from train.baseline import better
 from train.buffer import Buffer
 from train.collect import costs, environment, play
-from train.demonstrations import Demonstrations, as_decisions, as_links, canonical, demonstrate, follow
+from train.demonstrations import Demonstrations, as_decisions, canonical, demonstrate, follow
 from train.imitate import ImitationLearner, imitate
 from train.supervised import rate
 from train.supervised_config import ImitateConfig
@@ -95,8 +96,7 @@ def test_tours_run_counter_clockwise_and_agents_are_sorted_by_angle():
 def test_the_teachers_policy_plays_its_tours(case):
     instance, tours = case
     tours = canonical(instance.nodes, tours)
-    first, following = (torch.as_tensor(part)[None].numpy() for part in as_links(tours, instance.n_nodes))
-    demonstrations = Demonstrations(instance.nodes[None], first, following)
+    demonstrations = Demonstrations(instance.nodes[None], *as_links([tours], instance.n_nodes))
     problem = as_problem(demonstrations)
     env = environment(problem, TINY)
     episode = rollout(follow(demonstrations), env, "greedy", problem)

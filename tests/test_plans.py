@@ -11,6 +11,7 @@ from tiny import TINY_PLANS as TINY
 from tiny import interrupt_after
 
 from dan_policy.dan import DAN, DANConfig
+from dan_policy.games import as_links
 from dan_policy.joint import JointDAN
 from dan_policy.layers import DenseLogits
 from dan_policy.registry import load
@@ -19,7 +20,7 @@ from train import checkpoint
 from train.baseline import better
 from train.buffer import Buffer
 from train.collect import costs
-from train.demonstrations import Demonstrations, as_decisions, as_links, demonstrate
+from train.demonstrations import Demonstrations, as_decisions, demonstrate
 from train.imitate import ImitationLearner, imitate
 from train.network import observation_keys
 from train.plans import PLAN_KEYS, add_plans, plan_losses, visitors
@@ -35,8 +36,7 @@ KEYS = ("cities", "agents", "visited", "agent", "action_mask", ("game", "destina
 def solved():
     """Three agents: 0 goes east, then north; 1 visits one city next to the depot; 2 goes west, then south."""
     nodes = np.array([[0.5, 0.5], [0.9, 0.5], [0.9, 0.9], [0.5, 0.55], [0.1, 0.5], [0.1, 0.1]])
-    first, following = as_links([[0, 1, 2, 0], [0, 3, 0], [0, 4, 5, 0]], 6)
-    return Demonstrations(nodes[None], first[None], following[None])
+    return Demonstrations(nodes[None], *as_links([[[0, 1, 2, 0], [0, 3, 0], [0, 4, 5, 0]]], 6))
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.policies.nearest import nearest
-from dan_policy import JointConfig, JointDAN, solve
+from dan_policy import JointConfig, JointDAN, heuristics, planning, solve
 from dan_policy.games import begin
 from dan_policy.reconstruct import GAMES, _draw_team, _equivalent, _follow, _part, reconstruct
 from mtsp_env import Instance, check_tours, makespan, rules, tour_lengths, uniform
@@ -169,6 +169,27 @@ def test_more_agents_than_cities_and_one_agent():
         check_tours(instance, solution.tours)
         assert solution.makespan <= solve(instance, network, device="cpu").makespan
     assert tour_lengths(instance, solution.tours).max() == solution.makespan
+
+
+def test_rounds_have_the_precision_and_the_memory_of_their_games(monkeypatch):
+    """One greedy game is too small for bfloat16 to pay, and sixteen are not."""
+    monkeypatch.setattr(heuristics, "multiplies_bfloat16", lambda device: True)
+    counted, seen = [], set()
+    check = planning.check_memory
+    monkeypatch.setattr(planning, "check_memory", lambda *given: counted.append(given[:2]) or check(*given))
+
+    def network(cities, agents, visited):
+        seen.add((len(visited), torch.is_autocast_enabled("cpu")))
+        return nearest(cities, agents, visited)
+
+    network.supports_bfloat16 = True
+    instance = uniform(np.random.default_rng(9), 60, 2)
+    solve(instance, network, device="cpu")
+    assert seen == {(1, False)} and counted[-1] == ("samples", 1)
+    solve(instance, network, reconstruct=2, device="cpu")
+    assert seen == {(1, False), (GAMES, True)} and counted[-1] == ("samples", GAMES)
+    solve(instance, network, decode="sample", samples=20, reconstruct=1, device="cpu")
+    assert counted[-1] == ("samples", 20)
 
 
 def test_bad_rounds_are_named():

@@ -78,3 +78,5 @@ def test_the_table_compares_ways_to_search_on_one_thread(tmp_path, monkeypatch) 
     greedy, symmetric, _, few, many = (float(row[2]) for row in rows)
     assert greedy >= symmetric >= few >= many
     assert used == {1} and torch.get_num_threads() == threads
+    assert main(["sweep-search", "--rounds", "4", "-1", "--out", str(out)]) == 2
+    assert len(used) == 1, "refused before anything is planned"

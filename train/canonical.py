@@ -55,11 +55,3 @@ def counter_clockwise(nodes: np.ndarray, rest: list[int]) -> list[int]:
     x, y = (nodes[rest] - nodes[0]).T  # the depot is the origin and adds nothing
     twice_the_area = float((x[:-1] * y[1:] - x[1:] * y[:-1]).sum())  # the shoelace formula
     return rest if twice_the_area >= 0 else rest[::-1]
-
-
-def as_links(tours: Tours, n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """The first city of each of the m tours (m,), and the node that follows each node (n,)."""
-    following = np.zeros(n_nodes, np.int64)
-    for tour in tours:
-        following[tour[1:-1]] = tour[2:]
-    return np.array([tour[1] for tour in tours]), following

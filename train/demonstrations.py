@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -20,10 +21,11 @@ from torch import Tensor
 
 from dan_policy.actor import Key
 from dan_policy.episode import rollout
+from dan_policy.games import as_links, next_on_tour
 from mtsp_env import rules
 from mtsp_env.distributions import sample
 from mtsp_env.instance import Problem, Tours
-from train.canonical import as_links, canonical
+from train.canonical import canonical
 from train.collect import autocast, draw_scenario, draw_size, environment, present, rotated
 from train.lessons import Lessons, teach
 from train.network import student
@@ -65,9 +67,8 @@ def demonstrate(config: ImitateConfig, index: int) -> Demonstrations | Lessons |
     prefixes = roll_in(config, problem, begin) if begin else [[[0]] * n_agents] * batch
     iterations = config.teacher_iterations * (n_nodes - begin)
     tours = improve_batch(nodes, n_agents, iterations, seed, threads=1, tidy=True, prefixes=prefixes)
-    links = [as_links(canonical(*one), n_nodes) for one in zip(nodes, tours, prefixes, strict=True)]
-    first, following = (np.stack(part) for part in zip(*links, strict=True))
-    return Demonstrations(nodes, first, following, begin)
+    tours = [canonical(*one) for one in zip(nodes, tours, prefixes, strict=True)]
+    return Demonstrations(nodes, *as_links(tours, n_nodes), begin)
 
 
 def roll_in(config: ImitateConfig, problem: Problem, begin: int) -> list[Tours]:
@@ -84,14 +85,7 @@ def follow(demonstrations: Demonstrations, device: torch.device | str = "cpu") -
     """The teacher as a TorchRL policy: every agent takes the next node of its tour."""
     first = torch.as_tensor(demonstrations.first, device=device)
     following = torch.as_tensor(demonstrations.following, device=device)
-
-    def next_node(agent: Tensor, destination: Tensor) -> Tensor:
-        """The deciding agents (B,) and all agents' destinations (B, m) -> the deciding agents' next nodes (B,)"""
-        at = destination.gather(1, agent[:, None])
-        starts = first.gather(1, agent[:, None])
-        return torch.where(at == 0, starts, following.gather(1, at))[:, 0]
-
-    return TensorDictModule(next_node, ["agent", ("game", "destination")], ["action"])
+    return TensorDictModule(partial(next_on_tour, first, following), ["agent", ("game", "destination")], ["action"])
 
 
 def as_decisions(

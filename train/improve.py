@@ -14,10 +14,11 @@ import torch
 import tyro
 from torch import nn
 
+from dan_policy.games import as_links
 from mtsp_env import rules
 from mtsp_env.instance import Problem
 from train.collect import draw, play, repeat, rotated
-from train.demonstrations import Demonstrations, as_decisions, as_links
+from train.demonstrations import Demonstrations, as_decisions
 from train.loop import run, run_folder
 from train.network import observation_keys
 from train.plans import PLAN_KEYS, add_plans
@@ -71,10 +72,9 @@ def best_games(policy: nn.Module, problem: Problem, config: ImproveConfig) -> tu
     costs = -episode.reward.view(-1, config.samples)  # (B, samples)
     rows = costs.argmin(1) + torch.arange(len(costs), device=costs.device) * config.samples
     visits, destination = (episode.last["game", name][rows].cpu().numpy() for name in ("visits", "destination"))
-    links = [as_links(rules.tours(*state), problem.n_nodes) for state in zip(visits, destination, strict=True)]
-    first, following = (np.stack(part) for part in zip(*links, strict=True))
+    tours = [rules.tours(*state) for state in zip(visits, destination, strict=True)]
     nodes = torch.as_tensor(repeated.nodes)[rows].cpu().numpy()
-    return Demonstrations(nodes, first, following), costs.cpu().numpy()
+    return Demonstrations(nodes, *as_links(tours, problem.n_nodes)), costs.cpu().numpy()
 
 
 def improve(config: Annotated[ImproveConfig, tyro.conf.arg(name="")]) -> ImproveLearner:

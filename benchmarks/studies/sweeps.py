@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -15,16 +15,13 @@ from benchmarks.files import write_text
 from benchmarks.harness.machine import describe_machine
 from benchmarks.reports.markdown import markdown_table
 from benchmarks.suite import Cell, check_instances
-from dan_policy import solve
+from dan_policy import SolveOptions, solve
 from dan_policy.heuristics import sampling_clip
 
 RESULTS = Path(__file__).parents[1] / "results"
 SEED = 123  # not that of a test set or of training
 C_FACTORS = (1.0, 0.5, 2.0)  # in units of the C that ``solve`` uses
 VIEWS = (200, 100, 50)  # cities
-
-Options = dict[str, Any]
-"""Keywords of ``solve``."""
 
 
 def sweep_clip(
@@ -48,7 +45,6 @@ def sweep_clip(
     Raises:
         ValueError: fewer than 2 instances, or a bad size.
     """
-
     cells = _cells(sizes, instances)
     title = f"# Samples over C: best of {samples}{' in eight symmetries' if augment else ''}"
     note = (
@@ -56,9 +52,9 @@ def sweep_clip(
         f"Made by `python -m benchmarks sweep-clip --sizes {' '.join(sizes)} --instances {instances} "
         f"--samples {samples}{' --augment' if augment else ''}`."
     )
-    common: Options = {"decode": "sample", "samples": samples, "augment": augment}
+    common = SolveOptions(decode="sample", samples=samples, augment=augment)
     values = [[factor * sampling_clip(10.0, cell.n_nodes, augment) for factor in C_FACTORS] for cell in cells]
-    choices = [{f"{c:g}": common | {"clip": c} for c in cell_values} for cell_values in values]
+    choices = [{f"{c:g}": replace(common, clip=c) for c in cell_values} for cell_values in values]
     _sweep(out, title, note, "C", cells, choices, policy)
 
 
@@ -81,7 +77,6 @@ def sweep_view(
     Raises:
         ValueError: fewer than 2 instances, or a bad size.
     """
-
     cells = _cells(sizes, instances)
     title = f"# Cities in view: {'greedy' if samples is None else f'best of {samples} samples'}"
     note = (
@@ -89,9 +84,9 @@ def sweep_view(
         f"Made by `python -m benchmarks sweep-view --sizes {' '.join(sizes)} --instances {instances}"
         f"{'' if samples is None else f' --samples {samples}'}`."
     )
-    common: Options = {} if samples is None else {"decode": "sample", "samples": samples}
+    common = SolveOptions() if samples is None else SolveOptions(decode="sample", samples=samples)
     values = [[cell.n_nodes, *(view for view in VIEWS if view < cell.n_nodes)] for cell in cells]
-    choices = [{f"{view}": common | {"view": view} for view in cell_values} for cell_values in values]
+    choices = [{f"{view}": replace(common, view=view) for view in cell_values} for cell_values in values]
     _sweep(out, title, note, "cities in view", cells, choices, policy)
 
 
@@ -114,7 +109,7 @@ def sweep_search(
         out: file for the table.
 
     Raises:
-        ValueError: fewer than 2 instances, or a bad size.
+        ValueError: fewer than 2 instances, or a bad size, number of samples or of rounds.
     """
     cells = _cells(sizes, instances)
     note = (
@@ -122,9 +117,10 @@ def sweep_search(
         f"Made by `python -m benchmarks sweep-search --sizes {' '.join(sizes)} --instances {instances} "
         f"--samples {' '.join(map(str, samples))} --rounds {' '.join(map(str, rounds))} --policy {policy}`."
     )
-    ways: dict[str, Options] = {"greedy": {}, "greedy x8": {"augment": True}}
-    ways |= {f"best of {k} samples": {"decode": "sample", "samples": k, "augment": True} for k in samples}
-    ways |= {f"greedy x8, {k} rounds": {"augment": True, "reconstruct": k} for k in rounds}
+    symmetric = SolveOptions(augment=True)
+    ways = {"greedy": SolveOptions(), "greedy x8": symmetric}
+    ways |= {f"best of {k} samples": replace(symmetric, decode="sample", samples=k) for k in samples}
+    ways |= {f"greedy x8, {k} rounds": replace(symmetric, reconstruct=k) for k in rounds}
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -152,7 +148,7 @@ def _sweep(
     note: str,
     parameter: str,
     cells: list[Cell],
-    choices: list[dict[str, Options]],
+    choices: list[dict[str, SolveOptions]],
     policy: str,
 ) -> None:
     """Solve the instances of each cell with each of its choices; differences are to the cell's first choice."""
@@ -161,7 +157,7 @@ def _sweep(
         first = None
         for name, options in cell_choices.items():
             instances = track(cell.instances(SEED), f"{cell.label}, {parameter} {name}", transient=True)
-            solutions = [solve(instance, policy, seed=i, **options) for i, instance in enumerate(instances)]
+            solutions = [solve(instance, policy, options, seed=i) for i, instance in enumerate(instances)]
             cost = np.array([solution.makespan for solution in solutions])
             seconds = np.median([solution.seconds for solution in solutions])
             first = cost if first is None else first
