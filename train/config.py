@@ -94,6 +94,9 @@ class RunConfig:
     """cpu, cuda, cuda:1, ..."""
     threads: int | None = None
     """Number of CPU threads that PyTorch uses. None: PyTorch's default."""
+    compile: bool = False
+    """Run the network's attention layers through torch.compile, which needs a C++ compiler: steps take less time, but
+    the first ones wait for it. A run that is resumed may round differently."""
     tensorboard: bool = True
     """Write TensorBoard logs as well as CSV files."""
 

@@ -19,7 +19,7 @@ from train import checkpoint
 from train.collect import costs, draw_set
 from train.config import RunConfig
 from train.distributed import gather, rank, world_size
-from train.network import make_network, save_weights
+from train.network import compile_layers, make_network, save_weights
 
 PROGRESS = ("step", "instances", "seconds", "best")  # what a checkpoint says about how far the run has come
 VALIDATION_SEED = 987_654_321  # the same held-out instances in every run; training never uses it
@@ -54,6 +54,8 @@ class Learner(ABC):
             torch.manual_seed(config.seed + rank())
             self.rng = np.random.default_rng([config.seed, rank()])
         self.average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(config.average))
+        if config.compile:  # after the average has been copied, which plays games of any shape
+            compile_layers(self.network)
         self.validation_set = draw_set(np.random.default_rng(VALIDATION_SEED), config, config.validation_instances)
         self.step, self.instances, self.seconds, self.best = 0, 0, 0.0, math.inf
 
