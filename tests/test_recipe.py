@@ -114,8 +114,10 @@ def test_a_budget_in_seconds_alone_sets_no_limit_on_steps_and_anneals(written):
 @pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)
 def test_the_recipes_that_come_with_the_project_are_valid(path):
     stages = read_recipe(path)
-    assert [stage.command for stage in stages] == ["imitate", "imitate", "reinforce", "improve"]
-    assert stages[1].config.roll_in == PREVIOUS
+    assert [stage.command for stage in stages] == ["imitate", "reinforce", "imitate", "imitate"]
+    assert [getattr(stage.config, "labels", None) for stage in stages] == ["tours", None, "regrets", "regrets"]
+    assert all(stage.config.roll_in == PREVIOUS for stage in stages[2:])
+    assert all(stage.config.joint.distances for stage in stages)
     assert {stage.config.policy for stage in stages} == {"joint"}
     assert {stage.config.precision for stage in stages} == {"bfloat16"}
     assert all(stage.config.seconds for stage in stages)
