@@ -1,16 +1,18 @@
 """Compiled layers compute what the layers compute, for batches of any shape, and a run trains with them."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
-from tiny import TINY_PLANS
+from tiny import TINY, TINY_PLANS
 from torch import nn
 
 from dan_policy import JointConfig
 from dan_policy.joint import JointDAN
 from train.imitate import ImitationLearner
 from train.network import compile_layers
+from train.reinforce import ReinforceLearner
 
 SIZES = [(3, 2, 6), (5, 3, 9), (4, 2, 12)]  # rows, agents and nodes of a batch
 
@@ -53,11 +55,28 @@ def test_a_compiled_run_takes_the_same_steps(tmp_path):
     torch.testing.assert_close(torch.tensor(runs["compiled"]), torch.tensor(runs["eager"]), rtol=1e-4, atol=1e-5)
 
 
-def test_every_layer_is_compiled_for_any_shape(monkeypatch):
-    options = []
-    monkeypatch.setattr(nn.Module, "compile", lambda self, **given: options.append((type(self).__name__, given)))
-    compile_layers(JointDAN(JointConfig(n_layers=3)))
-    assert options == [("AttentionLayer", {"dynamic": True})] * 3
+@pytest.mark.parametrize("asked", [False, True])
+def test_a_run_compiles_every_layer_for_any_shape_but_not_the_average(asked, tmp_path, monkeypatch):
+    compiled = []
+    monkeypatch.setattr(nn.Module, "compile", lambda self, **options: compiled.append((self, options)))
+    learner = ImitationLearner(replace(TINY_PLANS, out=tmp_path, joint=JointConfig(n_layers=3), compile=asked))
+    learner.close()
+    assert isinstance(learner.network, JointDAN)
+    assert compiled == [(layer, {"dynamic": True}) for layer in learner.network.layers if asked]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("baseline", ["rollout", "shared"])
+def test_reinforce_trains_with_compiled_layers(baseline, tmp_path):
+    """Its baseline is a copy of the network, and it plays games with the network that it trains."""
+    config = replace(
+        TINY, policy="joint", joint=TINY_PLANS.joint, baseline=baseline, samples=2, compile=True, out=tmp_path
+    )
+    learner = ReinforceLearner(config)
+    logs = [learner.train_step() for _ in range(2)]
+    learner.validate()
+    learner.close()
+    assert all(math.isfinite(one["cost"]) and one["grad_norm"] > 0 for one in logs)
 
 
 def test_compiling_needs_layers():

@@ -16,7 +16,7 @@ from dan_policy.actor import Key, make_actor
 from dan_policy.registry import NETWORKS, build, load, save
 from mtsp_env.batched import BatchedMTSP
 from train.config import OVERRIDES, RunConfig
-from train.optimisers import HIDDEN_LAYERS
+from train.optimisers import hidden_layers
 from train.supervised_config import ImitateConfig
 
 
@@ -42,18 +42,14 @@ def make_network(config: RunConfig) -> nn.Module:
 
 
 def compile_layers(network: nn.Module) -> None:
-    """Run the layers of ``HIDDEN_LAYERS`` through ``torch.compile`` from now on, for batches of any shape.
+    """Run the network's ``hidden_layers`` through ``torch.compile`` from now on, for batches of any shape.
 
     The parameters and their names stay the same. What surrounds the layers depends on the data and is not compiled.
 
     Raises:
         ValueError: the network has no such layers.
     """
-    layers = [module for module in network.modules() if isinstance(module, HIDDEN_LAYERS)]
-    if not layers:
-        kinds = [kind.__name__ for kind in HIDDEN_LAYERS]
-        raise ValueError(f"compile=True needs a network with layers of {kinds}, got {type(network).__name__}")
-    for layer in layers:
+    for layer in hidden_layers(network, "compile=True"):
         layer.compile(dynamic=True)
 
 

@@ -35,18 +35,28 @@ def make_optimiser(name: OptimiserName, network: nn.Module, learning_rate: float
     if name == "adamw":
         return AdamW(network.parameters(), lr=learning_rate, weight_decay=weight_decay)
     matrices = hidden_matrices(network)
-    if not matrices:
-        kinds = [kind.__name__ for kind in HIDDEN_LAYERS]
-        raise ValueError(f"optimiser='muon' needs a network with layers of {kinds}, got {type(network).__name__}")
     taken = set(matrices)
     others = [parameter for parameter in network.parameters() if parameter not in taken]
     muon = Muon(matrices, lr=learning_rate, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw")
     return CombinedOptimiser(muon=muon, adamw=AdamW(others, lr=learning_rate, weight_decay=weight_decay))
 
 
-def hidden_matrices(network: nn.Module) -> list[nn.Parameter]:
-    """The parameters with two dimensions inside ``HIDDEN_LAYERS``, each once, in the network's order."""
+def hidden_layers(network: nn.Module, option: str) -> list[nn.Module]:
+    """The network's layers of the kinds in ``HIDDEN_LAYERS``, in its order.
+
+    Raises:
+        ValueError: there are none; the message says that ``option`` needs them.
+    """
     layers = [module for module in network.modules() if isinstance(module, HIDDEN_LAYERS)]
+    if not layers:
+        kinds = [kind.__name__ for kind in HIDDEN_LAYERS]
+        raise ValueError(f"{option} needs a network with layers of {kinds}, got {type(network).__name__}")
+    return layers
+
+
+def hidden_matrices(network: nn.Module) -> list[nn.Parameter]:
+    """The parameters with two dimensions inside ``hidden_layers``, each once, in the order of the network."""
+    layers = hidden_layers(network, "optimiser='muon'")
     inside = {parameter for layer in layers for parameter in layer.parameters() if parameter.ndim == 2}
     return [parameter for parameter in network.parameters() if parameter in inside]
 
