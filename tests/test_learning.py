@@ -12,11 +12,13 @@ import torch
 from benchmarks import best_known
 from benchmarks.policies import nearest
 from benchmarks.studies import ablations, curves
+from benchmarks.studies.variants import Variant
 from benchmarks.suite import SEED, Cell
 from train import checkpoint
 from train.learner import checkpoint_path
 from train.presets import QUICK, REFINE
-from train.supervised_config import ImitateConfig
+from train.reinforce import reinforce
+from train.supervised_config import ImitateConfig, ImproveConfig
 
 CELL = Cell(50, 5, 3)
 
@@ -26,8 +28,13 @@ def small(monkeypatch):
     monkeypatch.setattr(ablations, "SAMPLES", 2)
     monkeypatch.setattr(ablations, "CELLS", (CELL,))
     monkeypatch.setattr(ablations, "SIZES", {"n_nodes": (6, 8), "n_agents": (2, 2), "nodes_per_agent": 2})
-    monkeypatch.setattr(ablations, "ImitateConfig", partial(ImitateConfig, set_tokens=64, buffer=4))
+    monkeypatch.setattr(ablations, "IMITATE", {"workers": 0, "set_tokens": 64, "buffer": 4})
+    monkeypatch.setattr(
+        ablations, "REGRETS", ablations.REGRETS | {"set_tokens": 64, "buffer": 4, "teacher_iterations": 5}
+    )
     monkeypatch.setattr(ablations, "REFINE", replace(REFINE, batch_size=2, samples=2))
+    monkeypatch.setattr(ablations, "ROLLOUT", ablations.ROLLOUT | {"batch_size": 4, "challenge_instances": 2})
+    monkeypatch.setattr(ablations, "ImproveConfig", partial(ImproveConfig, batch_size=2, samples=2))
     monkeypatch.setitem(curves.SETTING, "n_nodes", (6, 6))
     monkeypatch.setitem(curves.SETTING, "n_agents", (2, 2))
     monkeypatch.setitem(curves.SETTING, "validation_instances", 8)
@@ -46,93 +53,138 @@ def test_gaps_are_to_the_best_known_tours():
     assert all(gap > -1e-6 for gap in gaps["sample"])
 
 
+SMALL_DAN = Variant("DAN", network={"city_layers": 1, "agent_layers": 0})
+SMALL_JOINT = Variant("joint", network={"n_layers": 1}, policy="joint", next_weight=0.5, assignment_weight=1.0)
+ATTENTION_MODEL = "benchmarks.policies.attention_model:AttentionModel"
+
+
 @pytest.mark.parametrize(
-    ("variant", "stages"),
+    ("variant", "weights"),
     [
-        (ablations.Variant("both", network={"city_layers": 1, "agent_layers": 0}), (True, True)),
-        (ablations.Variant("taught", imitation=1.0, network={"city_layers": 1}), (True, False)),
-        (ablations.Variant("alone", imitation=0.0, network={"city_layers": 1}), (False, True)),
-        (
-            ablations.Variant("other", imitation=0.0, policy="benchmarks.policies.attention_model:AttentionModel"),
-            (False, True),
+        (replace(SMALL_DAN, stages=(("imitate", 0.7), ("reinforce", 0.3))), 825_088),
+        (replace(SMALL_DAN, network={"city_layers": 1}), 1_022_848),
+        (replace(SMALL_DAN, network={"city_layers": 1}, stages=(("reinforce", 1.0),)), 1_022_848),
+        (replace(SMALL_DAN, network={}, stages=(("reinforce", 1.0),), policy=ATTENTION_MODEL), 710_272),
+        *(
+            (replace(SMALL_JOINT, stages=(("imitate", 0.5), (stage, 0.5))), 264_960)
+            for stage in ("reinforce", "rollout", "improve", "regrets")
         ),
     ],
+    ids=lambda value: "-".join([value.policy, *dict(value.stages)]) if isinstance(value, Variant) else "",
 )
 @pytest.mark.slow
-def test_a_variant_is_trained_in_its_stages(small, tmp_path, variant, stages):
-    result = ablations.train_and_evaluate(variant, 1.0, 0, tmp_path)
-    assert (result["imitation_steps"] > 0, result["reinforce_steps"] > 0) == stages
+def test_a_variant_is_trained_in_its_stages(small, tmp_path, variant, weights):
+    result = ablations.train_and_evaluate(variant, 1 / 60, 0, tmp_path)
+    assert list(result["steps"]) == [stage for stage, _ in variant.stages] and all(result["steps"].values())
     assert len(result["gaps"]["50x5"]["greedy"]) == len(result["gaps"]["50x5"]["sample"]) == 3
-    assert result["seconds"] > 0
-    weights = {"both": 825_088, "taught": 1_022_848, "alone": 1_022_848, "other": 710_272}
-    assert result["weights"] == weights[variant.name]
+    assert result["seconds"] > 0 and result["weights"] == weights
+    folders = ablations.stage_folders(variant, 1 / 60, 0, tmp_path)
+    inits = [checkpoint.read(folder / "checkpoint.pt")["config"]["init"] for folder in folders]
+    assert inits == [None, *(str(folder / "last.safetensors") for folder in folders[:-1])]
+
+
+@pytest.mark.slow
+def test_variants_that_begin_alike_share_what_they_begin_with(small, tmp_path):
+    stages = (("imitate", 0.5), ("reinforce", 0.5))
+    first, second = (
+        ablations.train_and_evaluate(replace(SMALL_DAN, name=name, stages=stages[:count]), 1 / 60, 0, tmp_path)
+        for name, count in (("first", 1), ("second", 2))
+    )
+    assert second["steps"]["imitate"] == first["steps"]["imitate"]
+    assert second["seconds"] > first["seconds"]
+    others = (
+        replace(SMALL_DAN, network={}),
+        replace(SMALL_DAN, policy="joint"),
+        replace(SMALL_DAN, next_weight=0.5),
+        replace(SMALL_DAN, assignment_weight=0.5),
+        replace(SMALL_DAN, optimiser="muon"),
+        replace(SMALL_DAN, stages=(("imitate", 0.4),)),
+        replace(SMALL_DAN, stages=(("reinforce", 1.0),)),
+    )
+    every = [(SMALL_DAN, 1.0, 0), (SMALL_DAN, 2.0, 0), (SMALL_DAN, 1.0, 1), *((other, 1.0, 0) for other in others)]
+    assert len({ablations.stage_folders(*each, tmp_path)[0] for each in every}) == len(every)
 
 
 @pytest.mark.slow
 def test_dense_labels_are_those_of_the_variant(small, tmp_path):
-    weighted = ablations.Variant("w", 1.0, {"n_layers": 1}, "joint", next_weight=0.5, assignment_weight=1.0)
-    plain = ablations.Variant("p", 1.0, {"n_layers": 1, "distances": True}, "joint", optimiser="muon")
-    for variant, labelled in ((weighted, True), (plain, False)):
-        result = ablations.train_and_evaluate(variant, 1.0, 0, tmp_path / variant.name)
-        assert result["imitation_steps"] > 0
-        state = checkpoint.read(checkpoint_path(ImitateConfig(out=tmp_path / variant.name / "imitation")))
+    plain = replace(SMALL_JOINT, next_weight=0.0, assignment_weight=0.0, optimiser="muon")
+    for variant, labelled in ((SMALL_JOINT, True), (plain, False)):
+        assert ablations.train_and_evaluate(variant, 1 / 60, 0, tmp_path)["steps"]["imitate"] > 0
+        (folder,) = ablations.stage_folders(variant, 1 / 60, 0, tmp_path)
+        state = checkpoint.read(checkpoint_path(ImitateConfig(out=folder)))
         assert ("muon" in state["optimiser"]) is (variant.optimiser == "muon")
         for name in ("next_loss", "assignment_loss"):
-            with next((tmp_path / variant.name).rglob(f"{name}.csv")).open() as file:
+            with next(folder.rglob(f"{name}.csv")).open() as file:
                 losses = [float(row[1]) for row in csv.reader(file)]
             assert any(losses) is labelled, name
 
 
 @pytest.mark.slow
-def test_an_interrupted_variant_continues_where_it_stopped(small, tmp_path):
-    variant = ablations.Variant("taught", 1.0, {"city_layers": 1})
-    first = ablations.train_and_evaluate(variant, 0.5, 0, tmp_path)
-    again = ablations.train_and_evaluate(variant, 0.5, 0, tmp_path)
-    assert again["imitation_steps"] == first["imitation_steps"] + 1  # no time was left, except for the step begun
-    longer = ablations.train_and_evaluate(variant, again["seconds"] + 0.5, 0, tmp_path)
-    assert longer["imitation_steps"] > again["imitation_steps"]
-    assert longer["seconds"] >= again["seconds"] + 0.5
+def test_an_interrupted_variant_continues_where_it_stopped(small, tmp_path, monkeypatch):
+    variant = replace(SMALL_DAN, stages=(("imitate", 0.5), ("reinforce", 0.5)))
+
+    def interrupted(config):
+        reinforce(replace(config, steps=2))
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setitem(ablations.TRAIN, "reinforce", interrupted)
+        ablations.train_and_evaluate(variant, 1 / 60, 0, tmp_path)
+    folders = ablations.stage_folders(variant, 1 / 60, 0, tmp_path)
+    before = [checkpoint.read(folder / "checkpoint.pt")["progress"]["step"] for folder in folders]
+    steps = ablations.train_and_evaluate(variant, 1 / 60, 0, tmp_path)["steps"]
+    assert steps["imitate"] == before[0]  # finished
+    assert steps["reinforce"] > before[1] > 0  # continued, if only by the step that was begun
 
 
-def outcome(variant, seed, gap, minutes=2.0):
-    """A made-up result."""
+def write_outcome(variant, seed, gap, folder, minutes=2.0):
+    """Write a made-up result."""
     gaps = {cell.label: {"greedy": [gap, 3 * gap], "sample": [gap / 10, 3 * gap / 10]} for cell in ablations.CELLS}
-    rest = {"reinforce_steps": 7, "seconds": 120.0, "weights": 1000, "gaps": gaps, "imitation_steps": 1234}
-    return {"minutes": minutes, "seed": seed, "name": variant.name} | rest
+    steps = {stage: 1234 + 5 * number for number, (stage, _) in enumerate(variant.stages)}
+    file = ablations.stage_folders(variant, minutes, seed, folder)[-1] / "result.json"
+    file.parent.mkdir(parents=True)
+    file.write_text(json.dumps({"steps": steps, "seconds": 120.0, "weights": 1000, "gaps": gaps}))
 
 
-def test_saved_results_are_reused_by_the_same_run_only(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(ablations.STUDIES, "dan", ablations.DAN_VARIANTS[:2])
-    for number, variant in enumerate(ablations.DAN_VARIANTS[:2]):
-        (tmp_path / f"dan-{number}-seed0.json").write_text(json.dumps(outcome(variant, 0, 0.1)))
+def test_a_table_has_a_line_for_each_variant(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(ablations.STUDIES, "dan", ablations.STUDIES["dan"][:2])
+    for variant in ablations.STUDIES["dan"]:
+        write_outcome(variant, 0, 0.1, tmp_path)
     ablations.main("dan", 2.0, (0,), tmp_path, tmp_path / "out" / "table.md")
     table = (tmp_path / "out" / "table.md").read_text()
     both = "| 20.0 ± 10.0 | 2.0 ± 1.0 "
-    assert f"| imitation alone {3 * both}| 2.0 | 1,234 | 7 | 1,000 |" in table.splitlines()
+    assert f"| imitation alone {3 * both}| 2.0 | imitate 1,234 | 1,000 |" in table.splitlines()
+    assert f"REINFORCE {3 * both}| 2.0 | imitate 1,234, reinforce 1,239 | 1,000 |" in table
     assert "python -m benchmarks ablations --study dan --minutes 2 --seeds 0`" in table
-    with pytest.raises(ValueError, match="belongs to another run"):
-        ablations.main("dan", 3.0, (0,), tmp_path, tmp_path / "table.md")
-    assert not (tmp_path / "table.md").exists()
     with pytest.raises(ValueError, match="name at least one seed"):
         ablations.main("dan", 2.0, (), tmp_path, tmp_path / "table.md")
+    assert not (tmp_path / "table.md").exists()
 
 
 def test_several_seeds_give_one_line_and_their_own_gaps(tmp_path, monkeypatch, capsys):
-    (variant,) = variants = ablations.DENSE_LABELS[:1]
+    (variant,) = variants = ablations.STUDIES["dense-labels"][:1]
     monkeypatch.setitem(ablations.STUDIES, "dense-labels", variants)
     for seed, gap in ((0, 0.1), (3, 0.2)):
-        (tmp_path / f"dense-labels-0-seed{seed}.json").write_text(json.dumps(outcome(variant, seed, gap)))
+        write_outcome(variant, seed, gap, tmp_path)
     ablations.main("dense-labels", 2.0, (0, 3), tmp_path, tmp_path / "table.md")
     lines = (tmp_path / "table.md").read_text().splitlines()
     both = "| 30.0 ± 15.0 | 3.0 ± 1.5 "  # the mean of two seeds on instances with the gaps 15 % and 45 %
-    assert f"| {variant.name} {3 * both}| 20.0, 40.0 | 2.0 | 1,234 | 7 | 1,000 |" in lines
+    assert f"| {variant.name} {3 * both}| 20.0, 40.0 | 2.0 | imitate 1,234 | 1,000 |" in lines
 
 
-def test_the_study_of_dense_labels_has_every_combination_for_the_joint_network():
-    joint = [variant for variant in ablations.DENSE_LABELS if variant.policy == "joint"]
-    labels = {(variant.next_weight > 0, variant.assignment_weight > 0) for variant in joint}
-    assert labels == {(False, False), (True, False), (False, True), (True, True)} and len(joint) == 4
-    assert {variant.imitation for variant in ablations.DENSE_LABELS} == {1.0}
+def test_studies_compare_what_they_say():
+    """Every combination of labels for the joint network; all kinds of refinement from the same start; equal time."""
+    dense = ablations.STUDIES["dense-labels"]
+    labels = [(v.next_weight > 0, v.assignment_weight > 0) for v in dense if v.policy == "joint"]
+    assert sorted(labels) == [(False, False), (False, True), (True, False), (True, True)]
+    assert {variant.stages for variant in dense} == {(("imitate", 1.0),)}
+    refined = ablations.STUDIES["refinement"]
+    assert [v.stages[-1][0] for v in refined] == ["imitate", "reinforce", "rollout", "improve", "regrets"]
+    assert len({variant.learner for variant in refined}) == 1 and len({v.stages[0] for v in refined[1:]}) == 1
+    for variants in ablations.STUDIES.values():
+        assert len({variant.name for variant in variants}) == len(variants)
+        assert len({(variant.learner, variant.stages) for variant in variants}) == len(variants)
+        assert all(sum(share for _, share in variant.stages) == pytest.approx(1.0) for variant in variants)
 
 
 @pytest.mark.slow
@@ -175,8 +227,10 @@ def test_curves_that_were_killed_before_their_first_checkpoint_are_begun_again(s
 
 
 def test_damaged_results_are_named(tmp_path):
-    (tmp_path / "dan-0-seed0.json").write_text('{"minutes": 1')
-    with pytest.raises(ValueError, match=r"dan-0-seed0\.json: not a JSON file"):
+    first = ablations.STUDIES["dan"][0]
+    (folder := ablations.stage_folders(first, 1.0, 0, tmp_path)[-1]).mkdir(parents=True)
+    (folder / "result.json").write_text('{"steps": 1')
+    with pytest.raises(ValueError, match=r"result\.json: not a JSON file"):
         ablations.main(minutes=1.0, folder=tmp_path, out=tmp_path / "table.md")
 
 

@@ -1,14 +1,18 @@
-"""Ablations: networks and ways of training them, trained for the same time and compared on one set of instances."""
+"""Ablations: networks and ways of training them, trained for the same time and compared on one set of instances.
+
+Variants that begin with the same stages share these stages' runs, also across studies: each stage has its folder in
+that of the stage before it.
+"""
 
 from __future__ import annotations
 
 import json
 import multiprocessing
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,11 +23,13 @@ from benchmarks import best_known
 from benchmarks.files import write_text
 from benchmarks.harness.machine import describe_machine
 from benchmarks.reports.markdown import markdown_table
+from benchmarks.studies.variants import NOTES, STUDIES, Stage, Study, Variant
 from benchmarks.suite import SEED, Cell
 from dan_policy import DANConfig
 from dan_policy.episode import Decode, rollout
 from dan_policy.joint import JointConfig
 from dan_policy.planning import SPEED
+from dan_policy.registry import load
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.checks import check_seconds
 from mtsp_env.files import read_json
@@ -32,82 +38,43 @@ from mtsp_env.tours import makespan
 from train import checkpoint
 from train.config import RunConfig
 from train.imitate import imitate
+from train.improve import improve
 from train.learner import checkpoint_path
-from train.optimisers import OptimiserName
 from train.presets import REFINE
 from train.reinforce import reinforce
-from train.supervised_config import ImitateConfig
+from train.supervised_config import ImitateConfig, ImproveConfig
 
 RESULTS = Path(__file__).parents[1] / "results"
 CELLS = (Cell(50, 5, 20), Cell(50, 10, 20), Cell(100, 10, 20))  # of Table 1
 SAMPLES = 64
 SIZES = {"n_nodes": (20, 50), "n_agents": (2, 10), "nodes_per_agent": 5}  # of the training instances
 
-
-@dataclass(frozen=True)
-class Variant:
-    """A network and how its training time is spent.
-
-    Attributes:
-        name: its name in the table.
-        imitation: share of the time for imitation; the rest is REINFORCE with a baseline shared by samples.
-        network: differences from the shipped configuration of the network, for the policies dan and joint.
-        policy: the network, as ``RunConfig.policy`` takes it.
-        next_weight: weight of the other agents' next nodes in the loss of imitation.
-        assignment_weight: weight of each city's visitor in the loss of imitation.
-        optimiser: the optimiser of imitation.
-    """
-
-    name: str
-    imitation: float = 0.7
-    network: dict[str, Any] = field(default_factory=dict)
-    policy: str = "dan"
-    next_weight: float = 0.0
-    assignment_weight: float = 0.0
-    optimiser: OptimiserName = "adamw"
-
-
-DAN_VARIANTS = (
-    Variant("as shipped: imitation, then REINFORCE"),
-    Variant("imitation alone", imitation=1.0),
-    Variant("REINFORCE alone", imitation=0.0),
-    Variant("visited cities not pruned", network={"prune_visited": False}),
-    Variant("one layer in the city encoder", network={"city_layers": 1}),
-    Variant("no agent encoder", network={"agent_layers": 0}),
-    Variant("no city-agent encoder", network={"city_agent_layers": 0}),
-    Variant("neither agent nor city-agent encoder", network={"agent_layers": 0, "city_agent_layers": 0}),
-    Variant("attention model (Kool et al. 2019)", policy="benchmarks.policies.attention_model:AttentionModel"),
-)
-
-DENSE_LABELS = (
-    Variant("DAN", imitation=1.0),
-    Variant("DAN, agent of every city", imitation=1.0, network={"assignment": True}, assignment_weight=1.0),
-    Variant("joint", imitation=1.0, policy="joint"),
-    Variant("joint, next node of every agent", imitation=1.0, policy="joint", next_weight=0.5),
-    Variant("joint, agent of every city", imitation=1.0, policy="joint", assignment_weight=1.0),
-    Variant("joint, both", imitation=1.0, policy="joint", next_weight=0.5, assignment_weight=1.0),
-)
-
-_JOINT = Variant("joint", imitation=1.0, policy="joint", next_weight=0.5, assignment_weight=1.0)
-
-JOINT_VARIANTS = (
-    _JOINT,
-    replace(_JOINT, name="joint, distances", network={"distances": True}),
-    replace(_JOINT, name="joint, Muon", optimiser="muon"),
-    replace(_JOINT, name="joint, distances, Muon", network={"distances": True}, optimiser="muon"),
-)
-
-Study = Literal["dan", "dense-labels", "joint"]
-STUDIES: dict[Study, tuple[Variant, ...]] = {
-    "dan": DAN_VARIANTS,
-    "dense-labels": DENSE_LABELS,
-    "joint": JOINT_VARIANTS,
+IMITATE: dict[str, Any] = {"workers": 0}
+REGRETS = IMITATE | {
+    "labels": "regrets",
+    "regret_temperature": 0.004,
+    "teacher_iterations": 300,
+    "learning_rate": 5e-4,
+    "warmup": 20,
+    "average": 0.99,
+    "passes": 4.0,
+    "set_tokens": 512,  # small sets and few of them: the first ones are ready after a minute
+    "buffer": 8,
 }
-NOTES: dict[Study, str] = {
-    "dan": "70 % imitation and 30 % REINFORCE, unless its name says otherwise",
-    "dense-labels": "imitation alone. The labels are the next node of the deciding agent and what the name says",
-    "joint": "imitation alone. The labels are the next node of every agent and the agent of every city; the optimiser "
-    "is AdamW unless the name says otherwise",
+ROLLOUT: dict[str, Any] = {  # as many episodes in a step as with the shared baseline
+    "baseline": "rollout",
+    "samples": 1,
+    "batch_size": 256,
+    "batch_tokens": REFINE.batch_tokens * REFINE.samples,
+    "challenge_every": 20,
+    "challenge_instances": 256,
+}
+TRAIN: dict[Stage, Callable[[Any], Any]] = {
+    "imitate": imitate,
+    "regrets": imitate,
+    "improve": improve,
+    "reinforce": reinforce,
+    "rollout": reinforce,
 }
 
 
@@ -125,24 +92,23 @@ def main(
     Args:
         study: "dan" for parts of DAN and of its training, "dense-labels" for networks and what they are taught: the
             next node of the deciding agent alone, that of every agent, the agent of every city, or both; "joint" for
-            distances in the joint network, and its optimiser.
+            distances in the joint network, and its optimiser; "refinement" for what may follow its imitation.
         minutes: training time of each variant and seed on one thread, the labelling of its instances included.
         seeds: seeds of the training; every variant is trained once with each. The instances that variants are compared
             on are never trained on.
-        folder: folder of the runs; variants that have a result there are not trained again.
+        folder: folder of the runs; what is finished there is not trained again.
         out: file for the table in Markdown; by default the study's file in benchmarks/results.
 
     Raises:
-        ValueError: ``minutes`` is not a finite number above 0, there are no seeds, or ``folder`` has damaged results or
-            those of runs of another length.
+        ValueError: ``minutes`` is not a finite number above 0, there are no seeds, or ``folder`` has damaged results.
     """
     check_seconds("minutes", minutes, unit="minutes")
     if not seeds:
         raise ValueError("name at least one seed")
     results = []
     for seed in seeds:  # a whole table for each seed, should the time end early
-        for number, variant in enumerate(STUDIES[study]):
-            results.append(_result(variant, minutes, seed, folder / f"{study}-{number}-seed{seed}"))
+        for variant in STUDIES[study]:
+            results.append({"seed": seed, "name": variant.name} | _result(variant, minutes, seed, folder))
             write_text(out or RESULTS / _file_name(study), _report(study, minutes, seeds, results))
     print(to_markdown(results))
 
@@ -151,33 +117,56 @@ def _file_name(study: Study) -> str:
     return "ablations.md" if study == "dan" else f"ablations-{study}.md"
 
 
+def stage_folders(variant: Variant, minutes: float, seed: int, folder: Path) -> list[Path]:
+    """The folder of each stage's run. Those of the first stages are the same for variants that begin alike."""
+    folders = [folder / variant.learner / f"seed-{seed}"]
+    for stage, share in variant.stages:
+        folders.append(folders[-1] / f"{stage}-{share * minutes:g}-minutes")
+    return folders[1:]
+
+
 def _result(variant: Variant, minutes: float, seed: int, folder: Path) -> dict[str, Any]:
-    """The result of a variant and seed from its file beside ``folder``; if there is none, the variant is trained."""
-    file = folder.with_suffix(".json")
+    """What ``train_and_evaluate`` returns for a variant and seed, from its file if the variant is finished."""
+    file = stage_folders(variant, minutes, seed, folder)[-1] / "result.json"
     if not file.exists():
         print(f"{variant.name}, seed {seed}: {minutes:g} minutes", flush=True)
         spawn = multiprocessing.get_context("spawn")  # a process for each: memory left by one slows no other
         with ProcessPoolExecutor(1, spawn, end_with_parent) as pool:
-            result = pool.submit(train_and_evaluate, variant, 60 * minutes, seed, folder).result()
-        write_text(file, json.dumps({"minutes": minutes, "seed": seed} | asdict(variant) | result))
-    result = read_json(file, keys=("minutes", "seed", "name"))
-    if (result["minutes"], result["seed"], result["name"]) != (minutes, seed, variant.name):
-        raise ValueError(f"{file} belongs to another run: {result['name']!r}, {result['minutes']:g} minutes")
-    return result
+            result = pool.submit(train_and_evaluate, variant, minutes, seed, folder).result()
+        write_text(file, json.dumps(result))
+    return read_json(file, keys=("steps", "seconds", "weights", "gaps"))
 
 
-def train_and_evaluate(variant: Variant, seconds: float, seed: int, folder: Path) -> dict[str, Any]:
-    """Train a variant; returns its steps, seconds and number of weights, and its gaps on each cell.
+def train_and_evaluate(variant: Variant, minutes: float, seed: int, folder: Path) -> dict[str, Any]:
+    """Train a variant; returns the steps of its stages, its seconds and number of weights, and its gaps on each cell.
 
-    A checkpoint in ``folder`` is continued.
+    Stages that are finished in ``folder`` are not trained again, and one that was interrupted is continued.
     """
     torch.set_num_threads(1)
-    options: dict[str, Any] = {"policy": variant.policy}
-    if variant.policy == "joint":
-        options["joint"] = JointConfig(**variant.network)
-    else:
-        options["network"] = DANConfig(**{"prune_visited": True} | variant.network)
-    common: dict[str, Any] = {
+    steps, seconds, init = {}, 0.0, None
+    for (stage, share), out in zip(variant.stages, stage_folders(variant, minutes, seed, folder), strict=True):
+        finished = out / "finished.json"
+        if not finished.exists():
+            config = stage_config(stage, variant, 60 * minutes * share, seed, out, init)
+            run = TRAIN[stage](continued(config, 60 * minutes * share))
+            write_text(finished, json.dumps({"steps": run.step, "seconds": run.seconds}))
+        done = read_json(finished, keys=("steps", "seconds"))
+        steps[stage], seconds, init = done["steps"], seconds + done["seconds"], str(out / "last.safetensors")
+    network = load(init, network=variant.policy if ":" in variant.policy else None)
+    return {
+        "steps": steps,
+        "seconds": seconds,
+        "weights": sum(p.numel() for p in network.parameters()),
+        "gaps": {cell.label: {d: gaps(network, cell, d) for d in ("greedy", "sample")} for cell in CELLS},
+    }
+
+
+def stage_config(stage: Stage, variant: Variant, seconds: float, seed: int, out: Path, init: str | None) -> RunConfig:
+    """The options of a stage's run, from the weights ``init`` of the stage before it."""
+    options: dict[str, Any] = {
+        "out": out,
+        "init": init,
+        "policy": variant.policy,
         "seed": seed,
         "steps": 10**9,  # the time decides
         "threads": 1,
@@ -186,39 +175,25 @@ def train_and_evaluate(variant: Variant, seconds: float, seed: int, folder: Path
         "checkpoint_every": 50,
         "tensorboard": False,
     }
-    common |= options | SIZES
-    imitation_steps, reinforce_steps, spent, init = 0, 0, 0.0, None
-    if variant.imitation > 0:
-        time = variant.imitation * seconds
-        config = ImitateConfig(
-            out=folder / "imitation",
-            workers=0,
-            anneal_seconds=time,
-            next_weight=variant.next_weight,
-            assignment_weight=variant.assignment_weight,
-            optimiser=variant.optimiser,
-            **common,
-        )
-        run = imitate(continued(config, time))
-        imitation_steps, spent, init = run.step, run.seconds, str(config.out / "last.safetensors")
-    if variant.imitation < 1:
-        config = replace(REFINE, out=folder / "reinforce", init=init, **common)
-        run = reinforce(continued(config, (1 - variant.imitation) * seconds))
-        reinforce_steps, spent = run.step, spent + run.seconds
-    network = run.averaged_network.eval()
-    return {
-        "imitation_steps": imitation_steps,
-        "reinforce_steps": reinforce_steps,
-        "seconds": spent,
-        "weights": sum(p.numel() for p in network.parameters()),
-        "gaps": {cell.label: {d: gaps(network, cell, d) for d in ("greedy", "sample")} for cell in CELLS},
+    options |= SIZES
+    if variant.policy == "joint":
+        options["joint"] = JointConfig(**variant.network)
+    else:
+        options["network"] = DANConfig(**{"prune_visited": True} | variant.network)
+    if stage in ("reinforce", "rollout"):
+        return replace(REFINE, **options | (ROLLOUT if stage == "rollout" else {}))
+    options |= {
+        "anneal_seconds": seconds,
+        "next_weight": variant.next_weight,
+        "assignment_weight": variant.assignment_weight,
+        "optimiser": variant.optimiser,
     }
+    if stage == "improve":
+        return ImproveConfig(**options)
+    return ImitateConfig(**options | (IMITATE if stage == "imitate" else REGRETS | {"roll_in": init}))
 
 
-Config = TypeVar("Config", bound=RunConfig)
-
-
-def continued(config: Config, seconds: float) -> Config:
+def continued(config: RunConfig, seconds: float) -> RunConfig:
     """The options of a run that trains for ``seconds`` in total, from its folder's checkpoint if there is one."""
     file = checkpoint_path(config)
     if not file.exists():
@@ -266,15 +241,15 @@ def to_markdown(results: Sequence[dict[str, Any]]) -> str:
                 *(f"{gap.mean():.1f} ± {sem(gap):.1f}" for gap in columns),
                 *([", ".join(f"{gap:.1f}" for gap in by_seed)] if several else []),
                 f"{np.mean([result['seconds'] for result in group]) / 60:.1f}",
-                f"{np.mean([result['imitation_steps'] for result in group]):,.0f}",
-                f"{np.mean([result['reinforce_steps'] for result in group]):,.0f}",
+                ", ".join(
+                    f"{stage} {np.mean([result['steps'][stage] for result in group]):,.0f}"
+                    for stage in group[0]["steps"]
+                ),
                 f"{group[0]['weights']:,}",
             ]
         )
     seeds = ["greedy, seed by seed"] if several else []
-    return markdown_table(
-        ["gap to best known, %", *heads, *seeds, "minutes", "steps of imitation", "of REINFORCE", "weights"], lines
-    )
+    return markdown_table(["gap to best known, %", *heads, *seeds, "minutes", "steps", "weights"], lines)
 
 
 def _report(study: Study, minutes: float, seeds: Sequence[int], results: Sequence[dict[str, Any]]) -> str:
