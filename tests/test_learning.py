@@ -103,6 +103,7 @@ def test_variants_that_begin_alike_share_what_they_begin_with(small, tmp_path):
     )
     every = [(SMALL_DAN, 1.0, 0), (SMALL_DAN, 2.0, 0), (SMALL_DAN, 1.0, 1), *((other, 1.0, 0) for other in others)]
     assert len({ablations.stage_folders(*each, tmp_path)[0] for each in every}) == len(every)
+    assert len({ablations.result_file(*each, tmp_path) for each in every}) == len(every)
 
 
 @pytest.mark.slow
@@ -141,23 +142,22 @@ def write_outcome(variant, seed, gap, folder, minutes=2.0):
     """Write a made-up result."""
     gaps = {cell.label: {"greedy": [gap, 3 * gap], "sample": [gap / 10, 3 * gap / 10]} for cell in ablations.CELLS}
     steps = {stage: 1234 + 5 * number for number, (stage, _) in enumerate(variant.stages)}
-    file = ablations.stage_folders(variant, minutes, seed, folder)[-1] / "result.json"
-    file.parent.mkdir(parents=True)
-    file.write_text(json.dumps({"steps": steps, "seconds": 120.0, "weights": 1000, "gaps": gaps}))
+    result = {"steps": steps, "seconds": 120.0, "weights": 1000, "gaps": gaps, "processor": f"Processor {seed}"}
+    ablations.result_file(variant, minutes, seed, folder).write_text(json.dumps(result))
 
 
 def test_a_table_has_a_line_for_each_variant(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(ablations.STUDIES, "dan", ablations.STUDIES["dan"][:2])
     for variant in ablations.STUDIES["dan"]:
         write_outcome(variant, 0, 0.1, tmp_path)
-    ablations.main("dan", 2.0, (0,), tmp_path, tmp_path / "out" / "table.md")
+    ablations.main("dan", 2.0, (0,), tmp_path / "runs", tmp_path, tmp_path / "out" / "table.md")
     table = (tmp_path / "out" / "table.md").read_text()
     both = "| 20.0 ± 10.0 | 2.0 ± 1.0 "
     assert f"| imitation alone {3 * both}| 2.0 | imitate 1,234 | 1,000 |" in table.splitlines()
     assert f"REINFORCE {3 * both}| 2.0 | imitate 1,234, reinforce 1,239 | 1,000 |" in table
     assert "python -m benchmarks ablations --study dan --minutes 2 --seeds 0`" in table
     with pytest.raises(ValueError, match="name at least one seed"):
-        ablations.main("dan", 2.0, (), tmp_path, tmp_path / "table.md")
+        ablations.main("dan", 2.0, (), tmp_path / "runs", tmp_path, tmp_path / "table.md")
     assert not (tmp_path / "table.md").exists()
 
 
@@ -166,8 +166,9 @@ def test_several_seeds_give_one_line_and_their_own_gaps(tmp_path, monkeypatch, c
     monkeypatch.setitem(ablations.STUDIES, "dense-labels", variants)
     for seed, gap in ((0, 0.1), (3, 0.2)):
         write_outcome(variant, seed, gap, tmp_path)
-    ablations.main("dense-labels", 2.0, (0, 3), tmp_path, tmp_path / "table.md")
+    ablations.main("dense-labels", 2.0, (0, 3), tmp_path / "runs", tmp_path, tmp_path / "table.md")
     lines = (tmp_path / "table.md").read_text().splitlines()
+    assert "on one thread (Processor 0 and Processor 3)" in lines[2]
     both = "| 30.0 ± 15.0 | 3.0 ± 1.5 "  # the mean of two seeds on instances with the gaps 15 % and 45 %
     assert f"| {variant.name} {3 * both}| 20.0, 40.0 | 2.0 | imitate 1,234 | 1,000 |" in lines
 
@@ -228,10 +229,9 @@ def test_curves_that_were_killed_before_their_first_checkpoint_are_begun_again(s
 
 def test_damaged_results_are_named(tmp_path):
     first = ablations.STUDIES["dan"][0]
-    (folder := ablations.stage_folders(first, 1.0, 0, tmp_path)[-1]).mkdir(parents=True)
-    (folder / "result.json").write_text('{"steps": 1')
-    with pytest.raises(ValueError, match=r"result\.json: not a JSON file"):
-        ablations.main(minutes=1.0, folder=tmp_path, out=tmp_path / "table.md")
+    ablations.result_file(first, 1.0, 0, tmp_path).write_text('{"steps": 1')
+    with pytest.raises(ValueError, match=r"seed-0\.json: not a JSON file"):
+        ablations.main(minutes=1.0, folder=tmp_path / "runs", results=tmp_path, out=tmp_path / "table.md")
 
 
 @pytest.mark.parametrize("module", [ablations, curves])

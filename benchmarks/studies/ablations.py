@@ -83,6 +83,7 @@ def main(
     minutes: float = 15.0,
     seeds: tuple[int, ...] = (0,),
     folder: Path = Path("runs/ablations"),
+    results: Path = RESULTS / "ablations",
     out: Path | None = None,
 ) -> None:
     """Train variants of a network and of its training for the same time on one thread, and compare them in a table.
@@ -96,21 +97,25 @@ def main(
         minutes: training time of each variant and seed on one thread, the labelling of its instances included.
         seeds: seeds of the training; every variant is trained once with each. The instances that variants are compared
             on are never trained on.
-        folder: folder of the runs; what is finished there is not trained again.
+        folder: folder of the runs; stages that are finished there are not trained again.
+        results: folder of the results; a variant that has one there is not trained again. Give another folder to
+            measure anew.
         out: file for the table in Markdown; by default the study's file in benchmarks/results.
 
     Raises:
-        ValueError: ``minutes`` is not a finite number above 0, there are no seeds, or ``folder`` has damaged results.
+        ValueError: ``minutes`` is not a finite number above 0, there are no seeds, or a file in one of the folders is
+            damaged.
     """
     check_seconds("minutes", minutes, unit="minutes")
     if not seeds:
         raise ValueError("name at least one seed")
-    results = []
+    measured = []
     for seed in seeds:  # a whole table for each seed, should the time end early
         for variant in STUDIES[study]:
-            results.append({"seed": seed, "name": variant.name} | _result(variant, minutes, seed, folder))
-            write_text(out or RESULTS / _file_name(study), _report(study, minutes, seeds, results))
-    print(to_markdown(results))
+            file = result_file(variant, minutes, seed, results)
+            measured.append({"seed": seed, "name": variant.name} | _result(variant, minutes, seed, folder, file))
+            write_text(out or RESULTS / _file_name(study), _report(study, minutes, seeds, measured))
+    print(to_markdown(measured))
 
 
 def _file_name(study: Study) -> str:
@@ -125,16 +130,21 @@ def stage_folders(variant: Variant, minutes: float, seed: int, folder: Path) -> 
     return folders[1:]
 
 
-def _result(variant: Variant, minutes: float, seed: int, folder: Path) -> dict[str, Any]:
-    """What ``train_and_evaluate`` returns for a variant and seed, from its file if the variant is finished."""
-    file = stage_folders(variant, minutes, seed, folder)[-1] / "result.json"
+def result_file(variant: Variant, minutes: float, seed: int, results: Path) -> Path:
+    """The file with the result of a variant and seed."""
+    stages = [f"{stage}-{share * minutes:g}" for stage, share in variant.stages]
+    return results / f"{'_'.join([variant.learner, *stages])}_seed-{seed}.json"
+
+
+def _result(variant: Variant, minutes: float, seed: int, folder: Path, file: Path) -> dict[str, Any]:
+    """What ``train_and_evaluate`` returns for a variant and seed, and where; from ``file`` if it exists."""
     if not file.exists():
         print(f"{variant.name}, seed {seed}: {minutes:g} minutes", flush=True)
         spawn = multiprocessing.get_context("spawn")  # a process for each: memory left by one slows no other
         with ProcessPoolExecutor(1, spawn, end_with_parent) as pool:
             result = pool.submit(train_and_evaluate, variant, minutes, seed, folder).result()
-        write_text(file, json.dumps(result))
-    return read_json(file, keys=("steps", "seconds", "weights", "gaps"))
+        write_text(file, json.dumps(result | {"processor": describe_machine()["processor"]}))
+    return read_json(file, keys=("steps", "seconds", "weights", "gaps", "processor"))
 
 
 def train_and_evaluate(variant: Variant, minutes: float, seed: int, folder: Path) -> dict[str, Any]:
@@ -253,12 +263,13 @@ def to_markdown(results: Sequence[dict[str, Any]]) -> str:
 
 
 def _report(study: Study, minutes: float, seeds: Sequence[int], results: Sequence[dict[str, Any]]) -> str:
-    machine, done = describe_machine(), sorted({result["seed"] for result in results})
+    processors = " and ".join(sorted({result["processor"] for result in results}))
+    done = sorted({result["seed"] for result in results})
     command = (
         f"python -m benchmarks ablations --study {study} --minutes {minutes:g} --seeds {' '.join(map(str, seeds))}"
     )
     return (
-        f"# Ablations\n\nEach variant was trained for {minutes:g} minutes on one thread ({machine['processor']}), "
+        f"# Ablations\n\nEach variant was trained for {minutes:g} minutes on one thread ({processors}), "
         f"labelling included, on n in {list(SIZES['n_nodes'])} and m in {list(SIZES['n_agents'])}, with seed "
         f"{' and '.join(map(str, done))}: {NOTES[study]}. Mean gap to the best known tours of Table 1's "
         f"{CELLS[0].count} instances in each column (n, m), ± standard error over the instances. A few trainings say "
