@@ -32,7 +32,27 @@ def test_the_average_is_the_mean_of_every_weight(files, tmp_path):
     for name, weight in mean.items():
         assert torch.allclose(weight, (2 * a[name] + b[name]) / 3, atol=1e-6), name
     assert load(out).config == SMALL
-    assert load_extra(out) == {"averaged": [{"step": "a"}, {"step": "b"}, {"step": "a"}]}
+    assert load_extra(out) == {"averaged": [{"step": "a"}, {"step": "b"}, {"step": "a"}], "shares": [1 / 3] * 3}
+
+
+@pytest.mark.slow
+def test_shares_carry_over_what_a_run_has_learnt(files, tmp_path):
+    """The weights of a, and half of what b has learnt since c."""
+    c, out = tmp_path / "c.safetensors", tmp_path / "sum.safetensors"
+    save(c, DAN(SMALL), step="c")
+    assert main(["average", *files, str(c), "--shares", "1", "0.5", "-0.5", "--out", str(out)]) == 0
+    a, b, c, summed = (load(file).state_dict() for file in (*files, c, out))
+    for name, weight in summed.items():
+        assert torch.allclose(weight, a[name] + 0.5 * (b[name] - c[name]), atol=1e-6), name
+    assert load_extra(out)["shares"] == [1.0, 0.5, -0.5]
+
+
+@pytest.mark.parametrize("shares", [("1",), ("0.5", "0.4"), ("1", "1"), ("nan", "1"), ("inf", "-inf")])
+def test_shares_that_do_not_add_up_are_refused(files, tmp_path, capsys, shares):
+    out = tmp_path / "mean.safetensors"
+    assert main(["average", *files, "--shares", *shares, "--out", str(out)]) == 2
+    assert "shares must be 2 numbers, one for each file, that add up to 1, got" in capsys.readouterr().err
+    assert not out.exists()
 
 
 @pytest.mark.slow
@@ -51,7 +71,7 @@ def test_files_without_extra_data_are_averaged(files, tmp_path):
     save_file(load(files[0]).state_dict(), files[0], kept)
     out = tmp_path / "mean.safetensors"
     assert main(["average", *files, "--out", str(out)]) == 0
-    assert load_extra(out) == {"averaged": [{}, {"step": "b"}]}
+    assert load_extra(out) == {"averaged": [{}, {"step": "b"}], "shares": [0.5, 0.5]}
 
 
 @pytest.mark.slow

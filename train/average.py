@@ -1,7 +1,8 @@
-"""The mean of several networks' weights."""
+"""Weighted means of several networks' weights."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import tyro
@@ -9,23 +10,36 @@ import tyro
 from dan_policy.registry import load, load_config, load_extra, save
 
 
-def average(files: tyro.conf.Positional[tuple[str, ...]], out: Path, network: str | None = None) -> None:
+def average(
+    files: tyro.conf.Positional[tuple[str, ...]],
+    out: Path,
+    shares: tuple[float, ...] | None = None,
+    network: str | None = None,
+) -> None:
     """Write the mean of the weights of runs that started from the same ones ("model soup", Wortsman et al. 2022).
 
     Runs with a common ancestor learn similar weights, and their noise cancels. Without one, the mean may be worse than
-    each of them: compare them with `validate`.
+    each of them: compare them with `validate`. Negative shares carry over what one run has learnt to the weights of
+    another ("task arithmetic", Ilharco et al. 2023): with `--shares 1 0.4 -0.4`, files A, B and C give A and 0.4 times
+    what B has learnt since C.
 
     Args:
         files: weights, or names of shipped models, at least 2; one that is named twice counts twice.
         out: file to write.
+        shares: the share of each file; they add up to 1. By default all are equal.
         network: package.module:factory, for weights of a network of your own.
 
     Raises:
         OSError: no such weights, or ``out`` cannot be written.
-        ValueError: fewer than 2 files, or networks of different kinds or shapes.
+        ValueError: fewer than 2 files, shares that are not one finite number for each file or do not add up to 1, or
+            networks of different kinds or shapes.
     """
     if len(files) < 2:
         raise ValueError(f"name at least 2 files to average, got {len(files)}")
+    if shares is None:
+        shares = (1 / len(files),) * len(files)
+    if len(shares) != len(files) or not math.isclose(sum(shares), 1.0, abs_tol=1e-6):  # NaN and inf are not close to 1
+        raise ValueError(f"shares must be {len(files)} numbers, one for each file, that add up to 1, got {shares}")
     networks = [load(file, network=network) for file in files]
     mean = load(files[0], network=network)
     configs = [getattr(one, "config", load_config(file)) for one, file in zip(networks, files, strict=True)]
@@ -33,6 +47,9 @@ def average(files: tyro.conf.Positional[tuple[str, ...]], out: Path, network: st
         if config != configs[0]:
             raise ValueError(f"{file} has another configuration than {files[0]}: {config}, {configs[0]}")
     states = [one.state_dict() for one in networks]
-    mean.load_state_dict({name: sum(state[name] for state in states) / len(states) for name in states[0]})
+    mean.load_state_dict(
+        {name: sum(share * state[name] for share, state in zip(shares, states, strict=True)) for name in states[0]}
+    )
     out.parent.mkdir(parents=True, exist_ok=True)
-    save(out, mean, network, load_config(files[0]), averaged=[load_extra(file) for file in files])
+    sources = [load_extra(file) for file in files]
+    save(out, mean, network, load_config(files[0]), averaged=sources, shares=list(shares))
