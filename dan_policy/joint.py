@@ -169,7 +169,10 @@ class JointDAN(nn.Module):
             if values is not None:
                 h = h + self._effect(key, values.reshape(len(h), -1), in_view, m)
         mask = None if real is None else torch.cat([torch.ones_like(decides), real], dim=1)  # (B, m + k)
-        distances = token_distances(agents, seen, (~visited).sum(1)) if self.config.distances else None
+        distances = None
+        if self.config.distances:  # scaled by the nodes in view: large instances then look like those of training
+            n_nodes = visited.new_full(visited.shape[:1], in_view.shape[1], dtype=torch.int64)
+            distances = token_distances(agents, seen, n_nodes if real is None else real.sum(1))
         biases: Iterable[Tensor | None] = repeat(None)
         if distances is not None:
             biases = (distances[:, None] * slope for slope in self.distance_slopes[:, :, None, None])
@@ -198,7 +201,7 @@ class JointDAN(nn.Module):
         return self.config.tanh_clip * torch.tanh(u)
 
 
-def token_distances(agents: Tensor, nodes: Tensor, n_open: Tensor) -> Tensor:
+def token_distances(agents: Tensor, nodes: Tensor, n_nodes: Tensor) -> Tensor:
     """Distances between agents' destinations and nodes, in multiples of the typical distance between neighbours.
 
     An agent's remaining travel time is added: what is between an agent and a node is the time until the agent can be
@@ -207,7 +210,7 @@ def token_distances(agents: Tensor, nodes: Tensor, n_open: Tensor) -> Tensor:
     Args:
         agents: (B, m, 3), destinations and remaining travel times.
         nodes: (B, k, 2).
-        n_open: (B,), number of unvisited nodes. n points in the unit square lie about 1 / sqrt(n) apart.
+        n_nodes: (B,), how many of the nodes are real. n points in the unit square lie about 1 / sqrt(n) apart.
 
     Returns:
         (B, m + k, m + k), symmetric, 0 on the diagonal.
@@ -221,7 +224,7 @@ def token_distances(agents: Tensor, nodes: Tensor, n_open: Tensor) -> Tensor:
     between[:, :m] += remaining[:, :, None]
     between[:, :, :m] += remaining[:, None]
     between.diagonal(dim1=1, dim2=2).zero_()
-    return between * n_open.to(between.dtype).sqrt()[:, None, None]
+    return between * n_nodes.to(between.dtype).sqrt()[:, None, None]
 
 
 def _rows(cities: Tensor, agents: Tensor, visited: Tensor, agent: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

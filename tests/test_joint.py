@@ -135,6 +135,17 @@ def test_a_view_holds_the_nearest_unvisited_cities(small):
         assert (dense.assignment[row, :, hidden] == 0.0).all()
 
 
+def test_cities_out_of_view_have_no_effect(small):
+    """Those out of view may as well be visited; with distances, they do not count in their scale either."""
+    cities, agents, visited, agent = observation()
+    small.config = replace(small.config, view=2)
+    logits = small(cities, agents, visited, agent)
+    hidden = visited | (logits <= -small.config.tanh_clip)
+    hidden[:, 0] = False
+    assert (hidden.sum(1) > visited.sum(1)).any()
+    assert torch.allclose(small(cities, agents, hidden, agent), logits, atol=1e-5)
+
+
 def test_a_view_of_all_cities_hides_none(small):
     seen = small(*observation())
     small.config = replace(small.config, view=8)
