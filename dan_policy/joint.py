@@ -171,8 +171,7 @@ class JointDAN(nn.Module):
         mask = None if real is None else torch.cat([torch.ones_like(decides), real], dim=1)  # (B, m + k)
         distances = None
         if self.config.distances:  # scaled by the nodes in view: large instances then look like those of training
-            n_nodes = visited.new_full(visited.shape[:1], in_view.shape[1], dtype=torch.int64)
-            distances = token_distances(agents, seen, n_nodes if real is None else real.sum(1))
+            distances = token_distances(agents, seen, (~visited).sum(1).clamp(max=in_view.shape[1]))
         biases: Iterable[Tensor | None] = repeat(None)
         if distances is not None:
             biases = (distances[:, None] * slope for slope in self.distance_slopes[:, :, None, None])

@@ -83,6 +83,22 @@ def test_a_variant_is_trained_in_its_stages(small, tmp_path, variant, weights):
     assert inits == [None, *(str(folder / "last.safetensors") for folder in folders[:-1])]
 
 
+def test_stages_are_the_kinds_of_training_that_they_say(tmp_path):
+    def config(stage):
+        return ablations.stage_config(stage, SMALL_JOINT, 9.0, 3, tmp_path, "joint")
+
+    assert config("reinforce").baseline == "shared" and config("rollout").baseline == "rollout"
+    episodes = [config(stage).batch_tokens * config(stage).samples for stage in ("reinforce", "rollout")]
+    assert episodes[0] == episodes[1]
+    assert (config("imitate").labels, config("imitate").roll_in) == ("tours", None)
+    assert (config("regrets").labels, config("regrets").roll_in) == ("regrets", "joint")
+    for stage in ("imitate", "improve", "regrets"):
+        assert config(stage).anneal_seconds == 9.0 and config(stage).next_weight == 0.5
+    for stage in ablations.TRAIN:
+        assert (config(stage).seed, config(stage).init, config(stage).threads) == (3, "joint", 1)
+        assert config(stage).n_nodes == ablations.SIZES["n_nodes"]
+
+
 @pytest.mark.slow
 def test_variants_that_begin_alike_share_what_they_begin_with(small, tmp_path):
     stages = (("imitate", 0.5), ("reinforce", 0.5))

@@ -19,14 +19,14 @@ def average(
     """Write the mean of the weights of runs that started from the same ones ("model soup", Wortsman et al. 2022).
 
     Runs with a common ancestor learn similar weights, and their noise cancels. Without one, the mean may be worse than
-    each of them: compare them with `validate`. Negative shares carry over what one run has learnt to the weights of
+    each of them: compare them with `validate`. A negative share carries over what one run has learnt to the weights of
     another ("task arithmetic", Ilharco et al. 2023): with `--shares 1 0.4 -0.4`, files A, B and C give A and 0.4 times
     what B has learnt since C.
 
     Args:
         files: weights, or names of shipped models, at least 2; one that is named twice counts twice.
         out: file to write.
-        shares: the share of each file; they add up to 1. By default all are equal.
+        shares: the share of each file; they add up to 1, and may be negative. By default all are equal.
         network: package.module:factory, for weights of a network of your own.
 
     Raises:
