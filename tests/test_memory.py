@@ -6,6 +6,26 @@ import pytest
 
 from benchmarks.__main__ import main
 from benchmarks.studies import memory
+from train import logs
+
+
+@pytest.mark.slow
+def test_logs_are_closed_before_their_folder_is_deleted(monkeypatch):
+    """Else the thread of TensorBoard may write to it meanwhile."""
+    closed = []
+
+    class NotedLogs(logs.Logs):
+        def __init__(self, folder, step, tensorboard):
+            super().__init__(folder, step, tensorboard)
+            self.folder = folder
+
+        def close(self):
+            super().close()
+            closed.append(self.folder.exists())
+
+    monkeypatch.setattr(logs, "Logs", NotedLogs)
+    memory.measure("training steps", 10)
+    assert closed == [True]
 
 
 @pytest.mark.parametrize("name", memory.CASES)

@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Generator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -93,10 +94,10 @@ def training_steps() -> Generator[None, None, None]:
 
     with tempfile.TemporaryDirectory() as folder:
         learner = ReinforceLearner(replace(QUICK, batch_size=8, challenge_every=50, challenge_instances=16))
-        logs = Logs(Path(folder), 0, tensorboard=True)
-        while True:
-            logs.write(learner.step + 1, learner.train_step())
-            yield
+        with closing(Logs(Path(folder), 0, tensorboard=True)) as logs:  # its thread writes to the folder until then
+            while True:
+                logs.write(learner.step + 1, learner.train_step())
+                yield
 
 
 CASES: dict[str, tuple[Callable[[], Generator[None, None, None]], int]] = {
