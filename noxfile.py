@@ -36,6 +36,7 @@ DAN_TESTS = [
     "tests/test_dan.py",
     "tests/test_games.py",
     "tests/test_heuristics.py",
+    "tests/test_kernels.py",
     "tests/test_mtsp_v0.py",
     "tests/test_planning.py",
     "tests/test_planning_policies.py",

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from importlib import import_module
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -50,7 +52,8 @@ class BatchedMTSP(EnvBase):
 
     ``td = env.step(td)["next"]`` is the quickest loop: what ``step`` returns under ``"next"`` can be stepped as it is.
     On a CPU the rules run in NumPy, on the tensors' own memory, which is several times faster than torch for arrays of
-    these sizes.
+    these sizes. If Numba is installed (the extra "reference"), plain games are played by compiled loops, which are
+    several times faster still (``mtsp_env.kernels``); the first step then takes some seconds, once per machine.
 
     ``SerialEnv``, ``ParallelEnv``, ``Collector(env, None)`` and ``ActionMask`` sample actions without the mask: give
     them ``masked_random_policy()``. It draws from torch's global generator, which each worker process seeds from its
@@ -107,6 +110,7 @@ class BatchedMTSP(EnvBase):
         self._last: TensorDictBase | None = None  # for tours()
         self._on_cpu = device is None or torch.device(device).type == "cpu"
         self._in_numpy = self._on_cpu
+        self._numpy_rules = _quickest_rules(self._world, self.rules)
         self._numpy_views: dict[str, tuple[torch.Tensor, np.ndarray]] = {}
         self._advance: Callable[[dict], tuple[dict, dict]] = self._decide
         self._make_specs()
@@ -242,13 +246,15 @@ class BatchedMTSP(EnvBase):
     def _decide(self, arrays: dict) -> tuple[dict, dict]:
         """One decision in every row: arrays of the game and ``action`` -> what ``_outputs`` returns."""
         before = rules.state_from_arrays(arrays, self.n_agents)
-        return self._outputs(rules.depart(before, self.rules, arrays["action"]), before)
+        depart = self._numpy_rules.depart if self._in_numpy else rules.depart
+        return self._outputs(depart(before, self.rules, arrays["action"]), before)
 
     def _outputs(self, state: rules.State, before: rules.State | None = None) -> tuple[dict, dict]:
         """Arrays at the root and arrays of the game; with the state before, also the reward of the decision."""
         terminated, truncated = rules.terminated(state), rules.truncated(state, self.rules)
         over = terminated | truncated
-        root = rules.observe(state, self.rules).arrays()
+        observe = self._numpy_rules.observe if self._in_numpy else rules.observe
+        root = observe(state, self.rules).arrays()
         root |= {"done": over[:, None], "terminated": terminated[:, None], "truncated": truncated[:, None]}
         if before is not None:
             reward = rules.reward(before, state, self.rules, over)
@@ -261,7 +267,7 @@ class BatchedMTSP(EnvBase):
             return arrays
         known = self._numpy_views  # of the last step's tensors: most steps go on from these
         return {
-            key: known[key][1] if key in known and known[key][0] is tensor else tensor.numpy()
+            key: known[key][1] if key in known and known[key][0] is tensor else tensor.contiguous().numpy()
             for key, tensor in arrays.items()
         }
 
@@ -333,6 +339,15 @@ class BatchedMTSP(EnvBase):
         if tensordict is None:
             raise ValueError("no game yet: call reset() first")
         return rules.state_from_arrays(self._library(dict(tensordict.get("game").items())), self.n_agents)
+
+
+def _quickest_rules(world: Iterable[str], settings: rules.Rules) -> ModuleType:
+    """The module whose ``depart`` and ``observe`` play these games in NumPy: ``kernels`` if it can, else ``rules``."""
+    try:
+        kernels = import_module("mtsp_env.kernels")
+    except (ImportError, RuntimeError):  # without Numba, or if Numba finds no folder that it may write its cache to
+        return rules
+    return kernels if kernels.can_play(world, settings) else rules
 
 
 def random_legal_action(action_mask: torch.Tensor, generator: torch.Generator | None = None) -> torch.Tensor:

@@ -283,14 +283,16 @@ class AECFace:
 
 
 class BatchedFace:
-    """``BatchedMTSP``, stepped and read as TorchRL does it."""
+    """``BatchedMTSP``, stepped and read as TorchRL does it; without ``compiled`` as if there were no Numba."""
 
     reward_tolerance = 1e-5  # float32
 
-    def __init__(self, game: Game):
+    def __init__(self, game: Game, compiled: bool = True):
         batch, n = game.nodes.shape[:2]
         world = {name: array[0] for name, array in game.world.items()}
         self.env = BatchedMTSP(n, game.n_agents, [batch], scenario=always(world), **asdict(game.rules))
+        if not compiled:
+            self.env._numpy_rules = rules
         arrays = {name: torch.tensor(array) for name, array in game.arrays.items()}
         self.td = self.env.reset(TensorDict({"game": arrays}, batch_size=[batch]), set_state=True)
 
@@ -331,6 +333,7 @@ FACES: dict[str, Callable] = {
     "torch": partial(RulesFace, torch.tensor),
     "aec": AECFace,
     "batched": BatchedFace,
+    "batched without Numba": partial(BatchedFace, compiled=False),
 }
 
 
