@@ -57,6 +57,7 @@ options = {IMITATION}, steps = 3, roll_in = "previous"}}
 name = "refine"
 command = "reinforce"
 preset = "refine"
+share = 0.25
 options = {{steps = 3, batch_size = 2, samples = 3, challenge_instances = 4, warmup = 2}}
 
 [[stages]]
@@ -65,6 +66,7 @@ command = "improve"
 options = {{steps = 3, batch_size = 2, samples = 3, warmup = 2}}
 """
 FOLDERS = ["first", "roll-in", "refine", "improve"]
+FINAL = dict.fromkeys(FOLDERS, "best.safetensors") | {"refine": "mixed.safetensors"}  # what a stage ends with
 
 
 @pytest.fixture
@@ -101,6 +103,7 @@ def test_a_recipe_is_read_into_configurations(tiny):
     assert roll_in.init == roll_in.roll_in == refine.init == improve.init == PREVIOUS
     assert (refine.baseline, refine.normalise, refine.speed) == (REFINE.baseline, REFINE.normalise, REFINE.speed)
     assert (refine.samples, refine.steps, refine.n_agents) == (3, 3, (1, 3))
+    assert [stage.share for stage in read_recipe(tiny)] == [1.0, 1.0, 0.25, 1.0]
 
 
 def test_a_budget_in_seconds_alone_sets_no_limit_on_steps_and_anneals(written):
@@ -121,6 +124,7 @@ def test_the_recipes_that_come_with_the_project_are_valid(path):
     assert {stage.config.policy for stage in stages} == {"joint"}
     assert {stage.config.precision for stage in stages} == {"bfloat16"}
     assert all(stage.config.seconds for stage in stages)
+    assert [stage.share for stage in stages] == [1.0, 0.35, 1.0, 1.0]
 
 
 @pytest.mark.parametrize(
@@ -148,6 +152,15 @@ def test_the_recipes_that_come_with_the_project_are_valid(path):
         ("n_nodes = [6, 9]", 'n_nodes = [6, "9"]', r"\(first\): n_nodes.1: .*valid integer"),
         ("tensorboard = false", "tensorboard = 0", r"\(first\): tensorboard: .*boolean"),
         ("tensorboard = false", "buffer = 4", r"\(refine\): buffer: .*; ReinforceConfig has no such option"),
+        ("share = 0.25", "share = 0", r"\(refine\): share must be a number above 0 and at most 1, got 0"),
+        ("share = 0.25", "share = nan", "share must be a number above 0 and at most 1, got nan"),
+        ("share = 0.25", "share = true", "share must be a number above 0 and at most 1, got True"),
+        ("share = 0.25", "share = 1.5", r"share must be .* at most 1, got 1\.5"),
+        (
+            'name = "first"',
+            'name = "first"\nshare = 0.5',
+            "share must be 1 in a stage that starts from no weights, got 0.5",
+        ),
         ("steps = 4", "seed = 4", r"\(first\): steps or seconds must be given"),
         ("steps = 4", 'steps = 4, roll_in = "previous"', "no stage comes before the first"),
         ("steps = 4", "steps = 4, resume = true", "resume is set by the command line"),
@@ -169,14 +182,21 @@ def test_stages_follow_one_another_and_are_logged(tiny, tmp_path):
     assert [stage["name"] for stage in log["stages"]] == FOLDERS and log["from_stage"] is None
     for stage, before in zip(log["stages"], [None, *FOLDERS], strict=False):
         progress = checkpoint.read(out / stage["name"] / "checkpoint.pt")["progress"]
-        options = load_extra(out / stage["weights"])["config"]
-        assert options["init"] == (None if before is None else str(out / before / "best.safetensors"))
+        options = load_extra(out / stage["name"] / "best.safetensors")["config"]
+        assert options["init"] == (None if before is None else str(out / before / FINAL[before]))
+        assert stage["weights"] == f"{stage['name']}/{FINAL[stage['name']]}"
         assert options["roll_in"] == options["init"] if stage["name"] == "roll-in" else True
         assert stage["status"] == "complete" and stage["steps"] == progress["step"] == (4 if before is None else 3)
         assert stage["instances"] == progress["instances"] > 0
         assert stage["hours"] == progress["seconds"] / 3600 > 0
         assert stage["best_validation_cost"] == progress["best"] <= stage["validation_cost"]
         load(out / stage["weights"])
+    began, best, mixed = (
+        load(out / file).state_dict()
+        for file in ("roll-in/best.safetensors", "refine/best.safetensors", "refine/mixed.safetensors")
+    )
+    for name, parameter in mixed.items():
+        torch.testing.assert_close(parameter, 0.75 * began[name] + 0.25 * best[name])
     with pytest.raises(FileExistsError, match="holds a run already: add --resume"):
         recipe(tiny, out)
     recipe(tiny, out, resume=True)  # nothing is left to do

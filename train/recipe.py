@@ -5,10 +5,11 @@ A recipe is a TOML file (``train/recipes/``):
 - ``[shared]`` holds options of all stages.
 - Each ``[[stages]]`` has a ``name``, the ``command`` that trains (``imitate``, ``reinforce`` or ``improve``), for
   ``reinforce`` perhaps a ``preset``, and its ``options``, named as in the command's configuration. Its budget is
-  ``steps``, or ``seconds`` of training and validation in all, or both.
+  ``steps``, or ``seconds`` of training and validation in all, or both. A stage that starts from weights may have a
+  ``share``: it then ends with the weights it started from and this share of what it has learnt.
 
-Every stage but the first starts from the best weights of the stage before (``init = "previous"``), which may also play
-the beginnings of its games (``roll_in = "previous"``).
+Every stage but the first starts from the weights of the stage before (``init = "previous"``), which may also play the
+beginnings of its games (``roll_in = "previous"``). A stage's weights are its best ones.
 """
 
 from __future__ import annotations
@@ -65,11 +66,14 @@ class Stage:
         name: names its folder and its entry in the log.
         command: a key of ``COMMANDS``.
         config: its options. ``seconds`` is its whole budget, and ``init`` and ``roll_in`` may be ``PREVIOUS``.
+        share: of what it has learnt, in (0, 1]: it ends with (1 - share) times the weights it started from, plus share
+            times its best ones.
     """
 
     name: str
     command: str
     config: RunConfig
+    share: float = 1.0
 
 
 def read_recipe(file: Path) -> list[Stage]:
@@ -95,7 +99,7 @@ def read_recipe(file: Path) -> list[Stage]:
 
 
 def _read_stage(where: str, entry: Any, shared: Any, first: bool) -> Stage:
-    _check_keys(where, entry, required=("name", "command"), optional=("preset", "options"))
+    _check_keys(where, entry, required=("name", "command"), optional=("preset", "share", "options"))
     name, command = entry["name"], entry["command"]
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9][\w-]*", name):
         raise ValueError(f"{where}: name must consist of letters, digits, '-' and '_', got {name!r}")
@@ -120,7 +124,12 @@ def _read_stage(where: str, entry: Any, shared: Any, first: bool) -> Stage:
         if command != "reinforce" or entry["preset"] not in PRESETS:
             raise ValueError(f"{where}: preset must be one of {sorted(PRESETS)} of reinforce, got {entry['preset']!r}")
         options = _merged(PRESETS[entry["preset"]].to_dict(), options)
-    return Stage(name, command, _config(where, COMMANDS[command].config, options))
+    config, share = _config(where, COMMANDS[command].config, options), entry.get("share", 1.0)
+    if isinstance(share, bool) or not isinstance(share, (int, float)) or not 0.0 < share <= 1.0:
+        raise ValueError(f"{where}: share must be a number above 0 and at most 1, got {share!r}")
+    if share < 1.0 and config.init is None:
+        raise ValueError(f"{where}: share must be 1 in a stage that starts from no weights, got {share!r}")
+    return Stage(name, command, config, float(share))
 
 
 def _config(where: str, kind: type[RunConfig], options: Mapping[str, Any]) -> RunConfig:

@@ -19,6 +19,7 @@ from dan_policy.registry import find
 from mtsp_env.checks import check_seconds
 from mtsp_env.files import atomic_write, write_json
 from train import checkpoint
+from train.average import average
 from train.config import RunConfig
 from train.learner import Learner, checkpoint_path
 from train.loop import run, run_folder, sole_writer
@@ -26,6 +27,7 @@ from train.recipe import COMMANDS, PREVIOUS, Stage, read_recipe
 from train.supervised_config import ImitateConfig
 
 LOG = "log.json"
+BEST, MIXED = "best.safetensors", "mixed.safetensors"  # in a stage's folder
 GIVEN = "init.safetensors"  # the copy of the weights that --init names
 
 
@@ -40,8 +42,8 @@ class Record:
     steps: int = 0
     instances: int = 0
     validation_cost: float | None = None  # of the last weights, once the stage is complete
-    best_validation_cost: float | None = None  # of the weights that the next stage starts from
-    weights: str | None = None  # their file, relative to the log, once the stage is complete
+    best_validation_cost: float | None = None  # of its best weights, before a share of them is taken
+    weights: str | None = None  # file that the next stage starts from, relative to the log, once the stage is complete
 
 
 @dataclass
@@ -206,11 +208,20 @@ def _train(stage: Stage, config: RunConfig, record: Record, left: float, write_l
             if learner.step >= config.steps or learner.seconds >= budget:
                 record.validation_cost = learner.validate()  # the last weights may be the best
                 learner.save()
-                record.status, record.weights = "complete", f"{stage.name}/best.safetensors"
+                record.status, record.weights = "complete", f"{stage.name}/{_final_weights(stage, config)}"
         finally:  # also if a signal ends the process, which `run` lets pass once everything is saved
             _update(record, learner)
             write_log()
     print(f"stage {stage.name}: {_summary(record)}", file=sys.stderr, flush=True)
+
+
+def _final_weights(stage: Stage, config: RunConfig) -> str:
+    """The file in the stage's folder with what it ends with, written here if that is a share of its best weights."""
+    if stage.share == 1.0 or config.init is None:
+        return BEST
+    network = config.policy if ":" in config.policy else None
+    average((config.init, str(config.out / BEST)), config.out / MIXED, (1.0 - stage.share, stage.share), network)
+    return MIXED
 
 
 def _update(record: Record, learner: Learner) -> None:
