@@ -1,6 +1,6 @@
 """One process for each agent: they know of each other only what they hear over sockets, and one of them is killed.
 
-    python examples/one_process_per_agent.py --policy joint --kill 1 0.8
+    python examples/one_process_per_agent.py --policy default --kill 1 0.8
 
 Each agent has a process of its own with its own copy of the policy, and a belief about the game. It hears from the
 others when they set off (for which node, when, and how long it will take), and notices by itself that one of them is
@@ -306,7 +306,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="One process for each agent, and one of them may be killed.")
     parser.add_argument("--n-nodes", type=int, default=20, help="number of nodes, the depot included")
     parser.add_argument("--n-agents", type=int, default=3)
-    parser.add_argument("--policy", default="nearest", help="nearest, or a shipped model such as joint")
+    parser.add_argument("--policy", default="nearest", help="nearest, or a shipped model such as default")
     parser.add_argument("--seed", type=int, default=0, help="of the instance")
     parser.add_argument("--kill", nargs=2, metavar=("AGENT", "TIME"), help="kill an agent's process at this time")
     options = parser.parse_args()

@@ -98,7 +98,7 @@ def test_games_go_on_from_any_saved_state(scenario: str) -> None:
 
 @pytest.mark.slow
 @in_every_scenario
-@pytest.mark.parametrize("name", ["default", "joint"])
+@pytest.mark.parametrize("name", ["default", "dan"])
 def test_networks_that_know_no_worlds_play_in_each(scenario: str, name: str) -> None:
     """Their games end, and a batch's cost is that of its rows."""
     env = make(scenario, batch=4, n_nodes=12, depot="wait")

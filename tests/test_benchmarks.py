@@ -236,7 +236,7 @@ def test_solvers_are_loaded_by_name(tmp_path, monkeypatch):
     (tmp_path / "needy.py").write_text("import a_package_that_nobody_has")
     monkeypatch.syspath_prepend(tmp_path)
     assert solvers.find("misbehaving:deals") is deals
-    assert solvers.look_up("dan-s64").options == {"samples": 64}
+    assert solvers.look_up("joint-s64").options == {"samples": 64}
     dan = ["dan-greedy", "dan-greedy-x8", "dan-s64", "dan-s64-x8", "dan-s256", "dan-improve"]
     assert solvers.expand(["nearest, dan", "dan-s64"]) == ["nearest", *dan]
     assert solvers.expand(["all"]) == list(solvers.SOLVERS)
@@ -264,7 +264,7 @@ def test_solving_is_timed_and_its_memory_is_measured(monkeypatch):
         speed_solve.torch, "set_num_threads", lambda threads: None
     )  # leave this process's threads alone
     before = speed_solve.peak_memory()
-    cost = speed_solve.measure(speed_solve.Case(30, 2, "greedy"), threads=1, repeats=2)
+    cost = speed_solve.measure(speed_solve.Case(30, 2, "greedy"), "dan", threads=1, repeats=2)
     assert cost.first > 0 and cost.later > 0
     assert 10 * 2**20 < before <= cost.memory_before <= cost.memory == speed_solve.peak_memory() < 100 * 2**30
 

@@ -116,7 +116,7 @@ def test_files_keep_what_is_read_and_older_files_read_nothing(tmp_path):
     seen = list(observations("everything"))[5]
     known, extra = inputs(seen)
     assert torch.equal(again(*known, *extra), reading(*known, *extra))
-    assert load("joint").config.reads == () and load("joint").in_keys == PLAIN_KEYS
+    assert load("default").config.reads == () and load("default").in_keys == PLAIN_KEYS
 
 
 @pytest.mark.slow

@@ -149,7 +149,7 @@ def test_submit_needs_one_way_to_plan(tmp_path, capsys):
         assert main(["submit", *options, *about]) == 2
         assert "--policy" in (error := capsys.readouterr().err) or "--seconds" in error
     in_worlds = [*about, "--test-set", "worlds"]
-    for options in (["--solver", "nearest", "--seconds", "1"], ["--policy", "joint", "--samples", "4"]):
+    for options in (["--solver", "nearest", "--seconds", "1"], ["--policy", "default", "--samples", "4"]):
         assert main(["submit", *options, *in_worlds]) == 2
         assert "the test set worlds takes greedy games" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

@@ -148,7 +148,7 @@ def test_teachers_games_solve_every_instance():
 
 @pytest.mark.slow
 def test_the_student_plays_until_few_cities_are_left():
-    config = replace(TINY, roll_in="joint", scenario=("arrivals",))
+    config = replace(TINY, roll_in="default", scenario=("arrivals",))
     problem = draw(np.random.default_rng(8), config, 4, size=(9, 3))
     env, lengths = environment(problem, config), set()
     for left in (8, 5, 2):

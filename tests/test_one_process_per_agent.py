@@ -83,7 +83,7 @@ def test_beliefs_are_what_the_environment_shows(speed: float) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("policy", ["nearest", "joint"])
+@pytest.mark.parametrize("policy", ["nearest", "default"])
 def test_without_faults_the_processes_decide_as_in_the_environment(policy: str) -> None:
     instance = draw(seed=1, n=12, m=3)
     decisions, env = play(instance, policy)

@@ -96,7 +96,7 @@ def test_every_network_of_the_registry_is_built_and_kept_by_name(tmp_path, name)
 
 
 def test_the_shipped_dans_are_of_the_first_format_and_are_read_as_before():
-    for name in ("default", "paper"):
+    for name in ("dan", "paper"):
         kept = metadata(registry.find(name))
         assert kept["format"] == "dan-policy-1"
         assert load(name).config == DANConfig(**json.loads(kept["config"]))

@@ -204,4 +204,4 @@ def test_a_run_resumes_bit_for_bit_and_workers_make_the_same_sets(tmp_path, monk
 )
 def test_bad_options_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
-        replace(TINY_PLANS, **({"labels": "regrets", "roll_in": "joint"} | change))
+        replace(TINY_PLANS, **({"labels": "regrets", "roll_in": "default"} | change))

@@ -85,7 +85,7 @@ def test_a_process_plans_with_a_shipped_policy_and_keeps_the_prefixes() -> None:
     from dan_policy import solve
 
     threads = torch.get_num_threads()
-    workers = Workers(1, policy="joint")
+    workers = Workers(1, policy="default")
     try:
         instance = Instance(np.random.default_rng(0).random((12, 2)), 2)
         tours = workers(instance, "dan", 1.0, 0, [[0, 3], [0]])
@@ -93,7 +93,7 @@ def test_a_process_plans_with_a_shipped_policy_and_keeps_the_prefixes() -> None:
         workers.close()
         torch.set_num_threads(threads)  # the service takes one for itself
     check_tours(instance, tours)
-    assert tours == solve(instance, "joint", device="cpu", prefixes=[[0, 3], [0]]).tours
+    assert tours == solve(instance, "default", device="cpu", prefixes=[[0, 3], [0]]).tours
 
 
 def test_a_hundred_requests_at_once_are_planned_in_order_and_answered() -> None:

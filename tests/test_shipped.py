@@ -8,11 +8,19 @@ from dan_policy import load, registry, solve
 from mtsp_env import uniform
 
 
-def test_there_is_a_default_with_a_card():
-    assert "default" in registry.shipped()
-    card = (registry.SHIPPED / "README.md").read_text()
-    for part in registry.load_extra("default")["averaged"]:
-        assert f"{part['instances']:,}" in card and f"{part['step']} steps" in card
+def runs_of(extra: dict) -> list[dict]:
+    """The runs whose weights were averaged, also if averages were averaged again."""
+    parts = extra.get("averaged")
+    return [extra] if parts is None else [run for part in parts for run in runs_of(part)]
+
+
+@pytest.mark.parametrize("name", ["default", "dan"])
+def test_the_card_names_every_run_behind_a_mean_of_weights(name):
+    card = (registry.SHIPPED / "README.md").read_text().split(f"## `{name}`")[1].split("\n## ")[0]
+    runs = runs_of(registry.load_extra(name))
+    assert len(runs) > 2
+    for run in runs:
+        assert f"{run['instances']:,}" in card and f"{run['step']:,} steps" in card, (run["instances"], run["step"])
 
 
 @pytest.mark.parametrize("name", registry.shipped())

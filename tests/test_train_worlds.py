@@ -124,7 +124,7 @@ def test_weights_start_to_read_with_no_effect(tmp_path):
         make_network(replace(config, init=str(tmp_path / "reading.safetensors"), reads=("service",)))
     assert load(tmp_path / "reading.safetensors").config.reads == ("service", "agent_speeds")
     with pytest.raises(ValueError, match="reads must be None: the policy 'dan' has no such option"):
-        make_network(replace(config, policy="dan", init="default", reads=("service",)))
+        make_network(replace(config, policy="dan", init="dan", reads=("service",)))
 
 
 def test_weights_start_to_use_distances_with_no_effect(tmp_path):

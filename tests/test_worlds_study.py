@@ -75,7 +75,7 @@ def test_decisions_that_break_a_rule_are_refused() -> None:
 
 @pytest.mark.slow
 def test_networks_decide_side_by_side_as_alone() -> None:
-    choose = chooser(load("joint"))
+    choose = chooser(load("default"))
     instances = [EVERYTHING.instance(number) for number in range(6)]
     together = play_together(batch(instances), EVERYTHING.rules, choose)
     for instance, decisions in zip(instances, together, strict=True):
@@ -171,7 +171,7 @@ def test_the_command_from_end_to_end(tmp_path: Path, capsys, monkeypatch) -> Non
     assert len({each.key for each in rows}) == len(rows) == 6 * 2 * 2
     assert all((each.searches is None) == (each.method in ("random", "nearest", "default")) for each in rows)
     report = (tmp_path / "report.md").read_text()
-    assert "DAN `default`, greedy" in report and "| everything |" in report
+    assert "| `default`, greedy" in report and "| everything |" in report
     assert (tmp_path / "6x2.png").stat().st_size > 5000
 
     assert main([*command, "--methods", "replanner-5", "--instances", "3"]) == 0
@@ -206,4 +206,4 @@ def test_damaged_rows_are_named(line: bytes, tmp_path: Path) -> None:
 
 def test_a_network_of_ones_own_is_a_method() -> None:
     own = find_method("runs/mine.safetensors")
-    assert own == replace(METHODS["joint"], title="`runs/mine.safetensors`, greedy", network=own.network)
+    assert own == replace(METHODS["default"], title="`runs/mine.safetensors`, greedy", network=own.network)

@@ -52,8 +52,8 @@ def _nearest(rng: np.random.Generator) -> Decide:
 METHODS: dict[str, Method] = {
     "random": Method("random", "local: its open cities", rule=_random),
     "nearest": Method("nearest city", "local: its open cities", rule=_nearest),
-    "default": Method("DAN `default`, greedy", OBSERVED, network="default"),
-    "joint": Method("`joint`, greedy", OBSERVED, network="joint"),
+    "default": Method("`default`, greedy", OBSERVED, network="default"),
+    "dan": Method("`dan`, greedy", OBSERVED, network="dan"),
     "world": Method("`world`, greedy", OBSERVED, network="world"),
     "plan-once": Method("plan once (50 ms), then the nearest agent", "global: at the start", milliseconds=50.0),
     "replanner-5": Method("Replanner, 5 ms per event", "global: at every event", milliseconds=5.0),

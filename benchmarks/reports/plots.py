@@ -14,8 +14,8 @@ from benchmarks.solvers import SOLVERS
 from benchmarks.suite import AnyCell, TsplibCell
 from mtsp_env.writing import atomic_write
 
-# A colour and a marker for each method: warm colours for DAN and the joint network, brown and pink for other papers'
-# networks, black for the reference, cold ones for the others
+# A colour and a marker for each method: warm colours for DAN, magenta for the joint network, brown and pink for other
+# papers' networks, black for the reference, cold ones for the others
 STYLE = {
     "random": ("0.75", "x"),
     "nearest": ("0.5", "X"),
@@ -26,10 +26,10 @@ STYLE = {
     "dan-s256": ("#d73027", "o"),
     "dan-paper-greedy": ("#c9a227", "o"),
     "dan-paper-s64": ("#c9a227", "p"),
-    "joint-greedy": ("#fb6a4a", "H"),
-    "joint-greedy-x8": ("#fb6a4a", "8"),
-    "joint-s64": ("#a50f15", "H"),
-    "joint-r16": ("#67000d", "H"),
+    "joint-greedy": ("#e6007e", "H"),
+    "joint-greedy-x8": ("#e6007e", "D"),
+    "joint-s64": ("#99004d", "H"),
+    "joint-r16": ("#4d0026", "H"),
     "dan-improve": ("#8c1c13", "P"),
     "schedulenet-greedy": ("#8c6d31", "o"),
     "schedulenet-greedy-x8": ("#8c6d31", "d"),

@@ -19,8 +19,8 @@ from mtsp_env.reading import read_file
 
 STYLES = {
     "random": ("0.75", "X"),
-    "default": STYLE["dan-s64"],
-    "joint": STYLE["joint-s64"],
+    "default": STYLE["joint-s64"],
+    "dan": STYLE["dan-s64"],
     "world": ("#8c1c13", "P"),
     "plan-once": STYLE["ortools-gls"],
     "replanner-5": ("0.35", "D"),

@@ -16,7 +16,7 @@ from dan_policy import solve as solve_with
 from mtsp_env.instance import Instance, Tours
 
 
-def dan(
+def shipped(
     instance: Instance,
     seconds: float,
     seed: int,
@@ -36,7 +36,7 @@ def dan(
 def schedulenet(
     instance: Instance, seconds: float, seed: int, samples: int | None = None, augment: bool = False
 ) -> Tours:
-    """Tours by ScheduleNet (``benchmarks/policies/schedulenet.py``); arguments as in ``dan``."""
+    """Tours by ScheduleNet (``benchmarks/policies/schedulenet.py``); arguments as in ``shipped``."""
     return _plan(_schedulenet(), instance, seed, samples, augment)
 
 
@@ -54,8 +54,8 @@ def _schedulenet() -> nn.Module:
     return load(WEIGHTS / "schedulenet.safetensors", network="benchmarks.policies.schedulenet:ScheduleNet")
 
 
-def improved_dan(instance: Instance, seconds: float, seed: int, policy: str = "default") -> Tours:
-    """Greedy tours by a shipped DAN, improved by the reference solver for ``seconds``."""
+def improved_dan(instance: Instance, seconds: float, seed: int, policy: str = "dan") -> Tours:
+    """Greedy tours by a shipped network, improved by the reference solver for ``seconds``."""
     return solve_with(instance, policy, seed=seed, device="cpu", improve=seconds).tours
 
 

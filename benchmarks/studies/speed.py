@@ -38,7 +38,7 @@ def main(
     Args:
         train: measure rollouts, imitation and REINFORCE at n = 20, 50, 100 and 200 instead, with their share of the
             machine's FLOP rate.
-        solve: measure time and memory of ``solve`` with the shipped model instead, on the CPU.
+        solve: measure time and memory of ``solve`` with the models `default` and `dan` instead, on the CPU.
         peers: measure a step of the batched environment and one of RL4CO's instead, on one thread of the CPU.
         device: cpu or cuda.
         seconds: seconds of measuring for each line.
@@ -81,12 +81,13 @@ def speed_table(device: str = "cpu", seconds: float = 3.0) -> Table:
     networks = {
         "official": (DAN(DANConfig.official()), "30"),
         "paper": (DAN(DANConfig.paper()), ""),
+        "dan": (load("dan"), ""),
         "default": (load("default"), ""),
     }
     for name, (network, target) in networks.items():
         rate, work = greedy_instances(network.to(device).eval(), device, seconds)
         share = f"{100 * rate * work / flops:.0f} %"
-        table.add_row(f"instances solved greedily, DAN {name}", "n=50, m=5, B=64", f"{rate:.1f}", target, share)
+        table.add_row(f"instances solved greedily, {name}", "n=50, m=5, B=64", f"{rate:.1f}", target, share)
     for precision in ("float32", "bfloat16"):
         rate = trained_instances(device, precision, seconds)
         table.add_row(f"instances trained on, quick, {precision}", "n=20, m=3, B=128", f"{rate:.1f}", "", "")

@@ -1,4 +1,4 @@
-"""Time and memory of ``dan_policy.solve`` with the shipped model, each case in a process of its own."""
+"""Time and memory of ``dan_policy.solve`` with shipped models, each case in a process of its own."""
 
 from __future__ import annotations
 
@@ -40,6 +40,7 @@ CASES = (
     Case(200, 10, "sample"),
     Case(1000, 10, "greedy", 6.0),
 )
+POLICIES = ("default", "dan")
 
 
 @dataclass(frozen=True)
@@ -59,28 +60,28 @@ class Cost:
     memory: int
 
 
-def speed_table(threads: tuple[int, ...] = (1, 2), repeats: int = 5) -> Table:
-    """Measure every case with each number of threads."""
-    heads = ("n, m", "threads", "target, s", "first call, s", "later calls, s", "memory, MiB", "before solving, MiB")
-    table = Table(*heads, title=f"dan_policy.solve, shipped model; {machine_title()}")
+def speed_table(threads: int = 1, repeats: int = 5) -> Table:
+    """Measure every case with each policy."""
+    heads = ("n, m", "policy", "target, s", "first call, s", "later calls, s", "memory, MiB", "before solving, MiB")
+    table = Table(*heads, title=f"dan_policy.solve, {threads} thread{'s' * (threads > 1)}; {machine_title()}")
     spawn = multiprocessing.get_context("spawn")
     for case in CASES:
-        for count in threads:
+        for policy in POLICIES:
             with ProcessPoolExecutor(1, spawn, end_with_parent) as pool:
-                cost = pool.submit(measure, case, count, repeats).result()
+                cost = pool.submit(measure, case, policy, threads, repeats).result()
             target = "" if case.target is None else f"{case.target:g}"
             memory = [f"{size / 2**20:,.0f}" for size in (cost.memory, cost.memory_before)]
-            table.add_row(case.name, str(count), target, f"{cost.first:.3f}", f"{cost.later:.3f}", *memory)
+            table.add_row(case.name, policy, target, f"{cost.first:.3f}", f"{cost.later:.3f}", *memory)
     return table
 
 
-def measure(case: Case, threads: int, repeats: int) -> Cost:
+def measure(case: Case, policy: str, threads: int, repeats: int) -> Cost:
     """Solve a test instance in this process, once and then ``repeats`` times more."""
     torch.set_num_threads(threads)
     tiny, (instance,) = Cell(5, 2, 1).instances(SEED)[0], Cell(case.n_nodes, case.n_agents, 1).instances(SEED)
-    solve(tiny, device="cpu")  # loads the model
+    solve(tiny, policy, device="cpu")  # loads the model
     before = peak_memory()
-    seconds = [solve(instance, decode=case.decode, device="cpu").seconds for _ in range(1 + repeats)]
+    seconds = [solve(instance, policy, decode=case.decode, device="cpu").seconds for _ in range(1 + repeats)]
     return Cost(seconds[0], median(seconds[1:]), before, peak_memory())
 
 

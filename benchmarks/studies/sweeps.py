@@ -28,7 +28,7 @@ def sweep_clip(
     sizes: tuple[str, ...] = ("50x5", "50x10", "100x5", "100x10", "200x10"),
     instances: int = 6,
     samples: int = 64,
-    policy: str = "default",
+    policy: str = "dan",
     augment: bool = False,
     out: Path = RESULTS / "clip.md",
 ) -> None:
@@ -62,7 +62,7 @@ def sweep_view(
     sizes: tuple[str, ...] = ("200x10", "300x10", "500x10", "1000x10"),
     instances: int = 8,
     samples: int | None = None,
-    policy: str = "default",
+    policy: str = "dan",
     out: Path = RESULTS / "view.md",
 ) -> None:
     """Compare tours of agents that see all cities with those of agents that see only the nearest ones; write a table.
@@ -95,7 +95,7 @@ def sweep_search(
     instances: int = 12,
     samples: tuple[int, ...] = (64, 128),
     rounds: tuple[int, ...] = (4, 8, 16),
-    policy: str = "joint",
+    policy: str = "default",
     out: Path = RESULTS / "search.md",
 ) -> None:
     """Compare ways to search with a policy: symmetries, samples, and re-construction of parts; write a table.

@@ -223,7 +223,7 @@ def main(
 
     Args:
         instances: number of instances of each scenario and size.
-        methods: random, nearest, default, joint, world, plan-once, replanner-5, replanner-50, or files of weights; by
+        methods: random, nearest, default, dan, world, plan-once, replanner-5, replanner-50, or files of weights; by
             default all of those whose weights are shipped.
         scenarios: names in ``mtsp_env.SCENARIOS``.
         sizes: n and m, such as 50x5.
