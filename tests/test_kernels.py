@@ -1,8 +1,5 @@
 """The compiled loops: the same arrays as ``rules.py``, bit for bit, and errors instead of reads past an array's end."""
 
-import sys
-from itertools import pairwise
-
 import numpy as np
 import pytest
 import torch
@@ -56,20 +53,18 @@ def games(**settings: object) -> list[TensorDict]:
     return steps
 
 
-def test_without_numba_the_environment_plays_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error", [ImportError("no Numba"), RuntimeError("no folder for the cache")], ids=str)
+def test_without_the_kernels_the_environment_plays_the_same(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(name: str) -> None:
+        raise error
+
     quick = games()
-    for missing in (None, "no folder for the cache"):
-        monkeypatch.setitem(sys.modules, "mtsp_env.kernels", None)
-        if missing:
-
-            def fail(name: str) -> None:
-                raise RuntimeError(f"cannot cache function: {name}")
-
-            monkeypatch.setattr("mtsp_env.batched.import_module", fail)
-        plain = games()
-        assert len(plain) == len(quick)
-        for one, other in zip(quick, plain, strict=True):
-            assert all(torch.equal(one[key], other[key]) for key in one.keys(True, True) if key != "action")
+    monkeypatch.setattr("mtsp_env.batched.import_module", fail)
+    assert BatchedMTSP(9, 3, 5)._numpy_rules is rules
+    plain = games()
+    assert len(plain) == len(quick)
+    for one, other in zip(quick, plain, strict=True):
+        assert all(torch.equal(one[key], other[key]) for key in one.keys(True, True) if key != "action")
 
 
 def test_an_environment_uses_them_if_it_can() -> None:
@@ -111,9 +106,6 @@ def test_they_are_compiled_once() -> None:
     for batch, n_nodes, n_agents in ((1, 2, 1), (3, 9, 2), (64, 30, 31)):
         for depot in ("open", "final"):
             env = BatchedMTSP(n_nodes, n_agents, batch, depot=depot)
-            steps = [env.reset()]
-            for _ in range(2):
-                steps.append(env.step(env.rand_action(steps[-1]))["next"])
-            for one, _ in pairwise(steps):
-                env.step(env.rand_action(one.clone()))
+            td = env.step(env.rand_action(env.reset()))["next"]
+            env.step(env.rand_action(td.clone()))
     assert len(kernels._depart.signatures) == len(kernels._observe.signatures) == 1

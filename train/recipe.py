@@ -9,7 +9,7 @@ A recipe is a TOML file (``train/recipes/``):
   ``share``: it then ends with the weights it started from and this share of what it has learnt.
 
 Every stage but the first starts from the weights of the stage before (``init = "previous"``), which may also play the
-beginnings of its games (``roll_in = "previous"``). A stage's weights are its best ones.
+beginnings of its games (``roll_in = "previous"``). Without a ``share``, a stage ends with its best weights.
 """
 
 from __future__ import annotations

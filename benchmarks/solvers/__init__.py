@@ -145,7 +145,7 @@ SOLVERS: dict[str, Solver] = {
     "joint-greedy-x8": _policy("shipped", weights="default", augment=True),
     "joint-s64": _policy("shipped", weights="default", samples=64),
     "joint-r16": _policy("shipped", weights="default", augment=True, reconstruct=16),
-    "dan-improve": _policy("improved_dan", "numba", anytime=True, polishes=True, weights="dan", policy="dan"),
+    "dan-improve": _policy("improved", "numba", anytime=True, polishes=True, weights="dan", policy="dan"),
     "schedulenet-greedy": _policy("schedulenet", weights="schedulenet"),
     "schedulenet-greedy-x8": _policy("schedulenet", weights="schedulenet", augment=True),
     "schedulenet-s64": _policy("schedulenet", weights="schedulenet", samples=64),

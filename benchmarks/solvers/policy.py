@@ -54,7 +54,7 @@ def _schedulenet() -> nn.Module:
     return load(WEIGHTS / "schedulenet.safetensors", network="benchmarks.policies.schedulenet:ScheduleNet")
 
 
-def improved_dan(instance: Instance, seconds: float, seed: int, policy: str = "dan") -> Tours:
+def improved(instance: Instance, seconds: float, seed: int, policy: str) -> Tours:
     """Greedy tours by a shipped network, improved by the reference solver for ``seconds``."""
     return solve_with(instance, policy, seed=seed, device="cpu", improve=seconds).tours
 

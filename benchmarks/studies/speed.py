@@ -79,10 +79,10 @@ def speed_table(device: str = "cpu", seconds: float = 3.0) -> Table:
         size = f"n=50, m=5, B={batch}"
         table.add_row("batched decisions, random legal actions", size, f"{rate:,.0f}", target, "")
     networks = {
-        "official": (DAN(DANConfig.official()), "30"),
-        "paper": (DAN(DANConfig.paper()), ""),
-        "dan": (load("dan"), ""),
-        "default": (load("default"), ""),
+        "DAN official": (DAN(DANConfig.official()), "30"),
+        "DAN paper": (DAN(DANConfig.paper()), ""),
+        "shipped dan": (load("dan"), ""),
+        "shipped default": (load("default"), ""),
     }
     for name, (network, target) in networks.items():
         rate, work = greedy_instances(network.to(device).eval(), device, seconds)
