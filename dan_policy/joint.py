@@ -174,7 +174,13 @@ class JointDAN(nn.Module):
             distances = token_distances(agents, seen, (~visited).sum(1).clamp(max=in_view.shape[1]))
         biases: Iterable[Tensor | None] = repeat(None)
         if distances is not None:
-            biases = (distances[:, None] * slope for slope in self.distance_slopes[:, :, None, None])
+            slopes = self.distance_slopes[:, :, None, None]
+            if mask is None:
+                biases = (distances[:, None] * slope for slope in slopes)
+            else:  # hide the padding in the same pass over memory
+                hidden = torch.zeros_like(mask, dtype=distances.dtype).masked_fill(~mask, -torch.inf)[:, None, None]
+                biases = (torch.addcmul(hidden, distances[:, None], slope) for slope in slopes)
+                mask = None
         for layer, bias in zip(self.layers, biases, strict=False):
             h = layer(h, h, mask, bias)  # (B, m + k, d); the bias (B, heads, m + k, m + k)
         h = self.norm(h)

@@ -50,8 +50,9 @@ class RunConfig:
     """How instances are drawn: uniform, clustered, or package.module:function for a generator of your own."""
     speed: float = 0.1
     """Distance per tick, the paper's Delta g."""
-    depot: Literal["open", "final"] = "open"
-    """Whether an agent that has returned to the depot may leave it again (open) or has finished (final)."""
+    depot: Literal["open", "wait", "final"] = "open"
+    """Whether an agent that has returned to the depot has finished (final) or may leave it again: it is asked again at
+    the next tick (open), or when something happens (wait)."""
     scenario: tuple[str, ...] = ("plain",)
     """The worlds to train in: names of scenarios, or package.module:function. Each batch draws one of them."""
     world_depot: Literal["open", "wait"] = "wait"
