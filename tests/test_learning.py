@@ -12,7 +12,7 @@ import torch
 from benchmarks import best_known
 from benchmarks.policies import nearest
 from benchmarks.studies import ablations, curves
-from benchmarks.studies.variants import Variant
+from benchmarks.studies.variants import Budget, Variant
 from benchmarks.suite import SEED, Cell
 from train import checkpoint
 from train.learner import checkpoint_path
@@ -21,6 +21,7 @@ from train.reinforce import reinforce
 from train.supervised_config import ImitateConfig, ImproveConfig
 
 CELL = Cell(50, 5, 3)
+SECOND = Budget(1 / 60)
 
 
 @pytest.fixture
@@ -74,18 +75,18 @@ ATTENTION_MODEL = "benchmarks.policies.attention_model:AttentionModel"
 )
 @pytest.mark.slow
 def test_a_variant_is_trained_in_its_stages(small, tmp_path, variant, weights):
-    result = ablations.train_and_evaluate(variant, 1 / 60, 0, tmp_path)
+    result = ablations.train_and_evaluate(variant, SECOND, 0, tmp_path)
     assert list(result["steps"]) == [stage for stage, _ in variant.stages] and all(result["steps"].values())
     assert len(result["gaps"]["50x5"]["greedy"]) == len(result["gaps"]["50x5"]["sample"]) == 3
     assert result["seconds"] > 0 and result["weights"] == weights
-    folders = ablations.stage_folders(variant, 1 / 60, 0, tmp_path)
+    folders = ablations.stage_folders(variant, SECOND, 0, tmp_path)
     inits = [checkpoint.read(folder / "checkpoint.pt")["config"]["init"] for folder in folders]
     assert inits == [None, *(str(folder / "last.safetensors") for folder in folders[:-1])]
 
 
 def test_stages_are_the_kinds_of_training_that_they_say(tmp_path):
     def config(stage):
-        return ablations.stage_config(stage, SMALL_JOINT, 9.0, 3, tmp_path, "joint")
+        return ablations.stage_config(stage, SMALL_JOINT, Budget(0.15), 3, tmp_path, "joint")
 
     assert config("reinforce").baseline == "shared" and config("rollout").baseline == "rollout"
     episodes = [config(stage).batch_tokens * config(stage).samples for stage in ("reinforce", "rollout")]
@@ -103,7 +104,7 @@ def test_stages_are_the_kinds_of_training_that_they_say(tmp_path):
 def test_variants_that_begin_alike_share_what_they_begin_with(small, tmp_path):
     stages = (("imitate", 0.5), ("reinforce", 0.5))
     first, second = (
-        ablations.train_and_evaluate(replace(SMALL_DAN, name=name, stages=stages[:count]), 1 / 60, 0, tmp_path)
+        ablations.train_and_evaluate(replace(SMALL_DAN, name=name, stages=stages[:count]), SECOND, 0, tmp_path)
         for name, count in (("first", 1), ("second", 2))
     )
     assert second["steps"]["imitate"] == first["steps"]["imitate"]
@@ -117,7 +118,9 @@ def test_variants_that_begin_alike_share_what_they_begin_with(small, tmp_path):
         replace(SMALL_DAN, stages=(("imitate", 0.4),)),
         replace(SMALL_DAN, stages=(("reinforce", 1.0),)),
     )
-    every = [(SMALL_DAN, 1.0, 0), (SMALL_DAN, 2.0, 0), (SMALL_DAN, 1.0, 1), *((other, 1.0, 0) for other in others)]
+    budgets = (Budget(1.0), Budget(2.0), Budget(1.0, "steps"))
+    every = [(SMALL_DAN, budget, 0) for budget in budgets]
+    every += [(SMALL_DAN, Budget(1.0), 1), *((other, Budget(1.0), 0) for other in others)]
     assert len({ablations.stage_folders(*each, tmp_path)[0] for each in every}) == len(every)
     assert len({ablations.result_file(*each, tmp_path) for each in every}) == len(every)
 
@@ -126,8 +129,8 @@ def test_variants_that_begin_alike_share_what_they_begin_with(small, tmp_path):
 def test_dense_labels_are_those_of_the_variant(small, tmp_path):
     plain = replace(SMALL_JOINT, next_weight=0.0, assignment_weight=0.0, optimiser="muon")
     for variant, labelled in ((SMALL_JOINT, True), (plain, False)):
-        assert ablations.train_and_evaluate(variant, 1 / 60, 0, tmp_path)["steps"]["imitate"] > 0
-        (folder,) = ablations.stage_folders(variant, 1 / 60, 0, tmp_path)
+        assert ablations.train_and_evaluate(variant, SECOND, 0, tmp_path)["steps"]["imitate"] > 0
+        (folder,) = ablations.stage_folders(variant, SECOND, 0, tmp_path)
         state = checkpoint.read(checkpoint_path(ImitateConfig(out=folder)))
         assert ("muon" in state["optimiser"]) is (variant.optimiser == "muon")
         for name in ("next_loss", "assignment_loss"):
@@ -146,34 +149,34 @@ def test_an_interrupted_variant_continues_where_it_stopped(small, tmp_path, monk
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setitem(ablations.TRAIN, "reinforce", interrupted)
-        ablations.train_and_evaluate(variant, 1 / 60, 0, tmp_path)
-    folders = ablations.stage_folders(variant, 1 / 60, 0, tmp_path)
+        ablations.train_and_evaluate(variant, SECOND, 0, tmp_path)
+    folders = ablations.stage_folders(variant, SECOND, 0, tmp_path)
     before = [checkpoint.read(folder / "checkpoint.pt")["progress"]["step"] for folder in folders]
-    steps = ablations.train_and_evaluate(variant, 1 / 60, 0, tmp_path)["steps"]
+    steps = ablations.train_and_evaluate(variant, SECOND, 0, tmp_path)["steps"]
     assert steps["imitate"] == before[0]  # finished
     assert steps["reinforce"] > before[1] > 0  # continued, if only by the step that was begun
 
 
-def write_outcome(variant, seed, gap, folder, minutes=2.0):
+def write_outcome(variant, seed, gap, folder):
     """Write a made-up result."""
     gaps = {cell.label: {"greedy": [gap, 3 * gap], "sample": [gap / 10, 3 * gap / 10]} for cell in ablations.CELLS}
     steps = {stage: 1234 + 5 * number for number, (stage, _) in enumerate(variant.stages)}
     result = {"steps": steps, "seconds": 120.0, "weights": 1000, "gaps": gaps, "processor": f"Processor {seed}"}
-    ablations.result_file(variant, minutes, seed, folder).write_text(json.dumps(result))
+    ablations.result_file(variant, Budget(2.0), seed, folder).write_text(json.dumps(result))
 
 
 def test_a_table_has_a_line_for_each_variant(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(ablations.STUDIES, "dan", ablations.STUDIES["dan"][:2])
     for variant in ablations.STUDIES["dan"]:
         write_outcome(variant, 0, 0.1, tmp_path)
-    ablations.main("dan", 2.0, (0,), tmp_path / "runs", tmp_path, tmp_path / "out" / "table.md")
+    ablations.main("dan", 2.0, None, (0,), tmp_path / "runs", tmp_path, tmp_path / "out" / "table.md")
     table = (tmp_path / "out" / "table.md").read_text()
     both = "| 20.0 ± 10.0 | 2.0 ± 1.0 "
     assert f"| imitation alone {3 * both}| 2.0 | imitate 1,234 | 1,000 |" in table.splitlines()
     assert f"REINFORCE {3 * both}| 2.0 | imitate 1,234, reinforce 1,239 | 1,000 |" in table
     assert "python -m benchmarks ablations --study dan --minutes 2 --seeds 0`" in table
     with pytest.raises(ValueError, match="name at least one seed"):
-        ablations.main("dan", 2.0, (), tmp_path / "runs", tmp_path, tmp_path / "table.md")
+        ablations.main("dan", 2.0, None, (), tmp_path / "runs", tmp_path, tmp_path / "table.md")
     assert not (tmp_path / "table.md").exists()
 
 
@@ -182,11 +185,34 @@ def test_several_seeds_give_one_line_and_their_own_gaps(tmp_path, monkeypatch, c
     monkeypatch.setitem(ablations.STUDIES, "dense-labels", variants)
     for seed, gap in ((0, 0.1), (3, 0.2)):
         write_outcome(variant, seed, gap, tmp_path)
-    ablations.main("dense-labels", 2.0, (0, 3), tmp_path / "runs", tmp_path, tmp_path / "table.md")
+    ablations.main("dense-labels", 2.0, None, (0, 3), tmp_path / "runs", tmp_path, tmp_path / "table.md")
     lines = (tmp_path / "table.md").read_text().splitlines()
     assert "on one thread (Processor 0 and Processor 3)" in lines[2]
     both = "| 30.0 ± 15.0 | 3.0 ± 1.5 "  # the mean of two seeds on instances with the gaps 15 % and 45 %
     assert f"| {variant.name} {3 * both}| 20.0, 40.0 | 2.0 | imitate 1,234 | 1,000 |" in lines
+
+
+@pytest.mark.slow
+def test_equal_steps_learn_from_the_same_instances(small, tmp_path):
+    """Whatever the network and the labels; a folder for each budget; as many steps as asked for."""
+    budget = Budget(3, "steps")
+    instances = []
+    for variant in (SMALL_DAN, SMALL_JOINT):
+        assert ablations.train_and_evaluate(variant, budget, 0, tmp_path)["steps"] == {"imitate": 3}
+        (folder,) = ablations.stage_folders(variant, budget, 0, tmp_path)
+        progress = checkpoint.read(folder / "checkpoint.pt")["progress"]
+        instances.append((progress["step"], progress["instances"]))
+    assert instances[0] == instances[1]
+
+
+def test_steps_are_for_variants_with_one_stage(tmp_path):
+    with pytest.raises(ValueError, match="steps must be None for the study 'refinement'"):
+        ablations.main("refinement", steps=5, folder=tmp_path / "runs", out=tmp_path / "table.md")
+    with pytest.raises(ValueError, match="steps must be"):
+        ablations.main("joint", steps=0, folder=tmp_path / "runs", out=tmp_path / "table.md")
+    (variant,) = ablations.STUDIES["dense-labels"][:1]
+    config = ablations.stage_config("imitate", variant, Budget(7, "steps"), 0, tmp_path, None)
+    assert config.steps == 7 and config.anneal_seconds is None and config.seconds is None
 
 
 def test_studies_compare_what_they_say():
@@ -245,7 +271,7 @@ def test_curves_that_were_killed_before_their_first_checkpoint_are_begun_again(s
 
 def test_damaged_results_are_named(tmp_path):
     first = ablations.STUDIES["dan"][0]
-    ablations.result_file(first, 1.0, 0, tmp_path).write_text('{"steps": 1')
+    ablations.result_file(first, Budget(1.0), 0, tmp_path).write_text('{"steps": 1')
     with pytest.raises(ValueError, match=r"seed-0\.json: not a JSON file"):
         ablations.main(minutes=1.0, folder=tmp_path / "runs", results=tmp_path, out=tmp_path / "table.md")
 

@@ -136,7 +136,7 @@ def _costs_of_tours(
     """(N, m, m) What is added to the loss if agent a takes the tour that the plan gives to agent b."""
     plan, deciding = decisions["plan"], _deciding(decisions)[:, :, None]  # (N, m, 1)
     n_agents = plan["next"].shape[1]
-    policy = logits.policy.masked_fill(~decisions["action_mask"], -torch.inf).log_softmax(1)  # (N, n)
+    policy = policy_log_probs(logits.policy, decisions)  # (N, n)
     cost = -policy.gather(1, plan["next"])[:, None] / len(decisions)  # (N, 1, m)
     if logits.next is None:
         cost = cost.where(deciding, 0.0)
@@ -152,6 +152,17 @@ def _costs_of_tours(
         visits = functional.one_hot(plan["visitor"], n_agents).to(log_prob.dtype)  # (N, n, m)
         cost = cost - assignment_weight / cities.sum().clamp(min=1) * (log_prob @ visits)
     return cost
+
+
+def policy_log_probs(logits: Tensor, decisions: TensorDictBase) -> Tensor:
+    """(N, n) Log-probabilities of the deciding agent's next node.
+
+    The depot counts as legal, also if the rule forbids it. A network that relied on the mask of "final", which keeps
+    the last agent from going home while there are cities, would go home too early by another rule.
+    """
+    legal = decisions["action_mask"].clone()
+    legal[:, 0] = True
+    return logits.float().masked_fill(~legal, -torch.inf).log_softmax(1)
 
 
 def _deciding(decisions: TensorDictBase) -> Tensor:

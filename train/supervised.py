@@ -10,13 +10,12 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from dan_policy.actor import make_actor, network_keys
+from dan_policy.actor import network_keys
 from dan_policy.layers import DenseLogits
 from train.collect import autocast
 from train.learner import Learner
-from train.loss import log_probs
 from train.optimisers import make_optimiser
-from train.plans import match_plans, plan_losses
+from train.plans import match_plans, plan_losses, policy_log_probs
 from train.supervised_config import SupervisedConfig
 
 
@@ -93,17 +92,18 @@ def imitation_losses(network: nn.Module, decisions: TensorDictBase, config: Supe
     """
     if "target" in decisions.keys():  # noqa: SIM118 (a TensorDict is no mapping)
         return _target_losses(network, decisions)
+    inputs = [decisions.get(key, None) for key in network_keys(network)]
     if "plan" in decisions.keys():  # noqa: SIM118 (a TensorDict is no mapping)
         forward_dense: Any = network.forward_dense
-        logits: DenseLogits = forward_dense(*(decisions.get(key, None) for key in network_keys(network)))
+        logits: DenseLogits = forward_dense(*inputs)
         if config.plan_matching == "invariant":
             decisions = match_plans(logits, decisions, config.next_weight, config.assignment_weight)
-        log_prob = logits.policy.masked_fill(~decisions["action_mask"], -torch.inf).log_softmax(1)
-        log_prob = log_prob.gather(1, decisions["action"][:, None])[:, 0]
+        policy = logits.policy
         next_loss, assignment_loss = plan_losses(logits, decisions)
     else:
-        log_prob = log_probs(make_actor(network), decisions)
-        next_loss = assignment_loss = log_prob.new_zeros(())
+        policy = network(*inputs)
+        next_loss = assignment_loss = policy.new_zeros(())
+    log_prob = policy_log_probs(policy, decisions).gather(1, decisions["action"][:, None])[:, 0]
     loss = -log_prob.mean()
     total = loss + config.next_weight * next_loss + config.assignment_weight * assignment_loss
     agreed = (log_prob.detach() > math.log(0.5)).sum()

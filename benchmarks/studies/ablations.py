@@ -1,4 +1,4 @@
-"""Ablations: networks and ways of training them, trained for the same time and compared on one set of instances.
+"""Ablations: networks and ways of training them, trained equally long and compared on one set of instances.
 
 Variants that begin with the same stages share these stages' runs, also across studies: each stage has its folder in
 that of the stage before it.
@@ -23,7 +23,7 @@ from benchmarks import best_known
 from benchmarks.files import write_text
 from benchmarks.harness.machine import describe_machine
 from benchmarks.reports.markdown import markdown_table
-from benchmarks.studies.variants import NOTES, STUDIES, Stage, Study, Variant
+from benchmarks.studies.variants import NOTES, STUDIES, Budget, Stage, Study, Variant
 from benchmarks.suite import SEED, Cell
 from dan_policy import DANConfig
 from dan_policy.episode import Decode, rollout
@@ -31,7 +31,7 @@ from dan_policy.joint import JointConfig
 from dan_policy.planning import SPEED
 from dan_policy.registry import load
 from mtsp_env.batched import BatchedMTSP
-from mtsp_env.checks import check_seconds
+from mtsp_env.checks import check_count, check_seconds
 from mtsp_env.files import read_json
 from mtsp_env.processes import end_with_parent
 from mtsp_env.tours import makespan
@@ -81,12 +81,13 @@ TRAIN: dict[Stage, Callable[[Any], Any]] = {
 def main(
     study: Study = "dan",
     minutes: float = 15.0,
+    steps: int | None = None,
     seeds: tuple[int, ...] = (0,),
     folder: Path = Path("runs/ablations"),
     results: Path = RESULTS / "ablations",
     out: Path | None = None,
 ) -> None:
-    """Train variants of a network and of its training for the same time on one thread, and compare them in a table.
+    """Train variants of a network and of its training equally long on one thread, and compare them in a table.
 
     The same command continues an interrupted study, also within a variant.
 
@@ -95,6 +96,8 @@ def main(
             next node of the deciding agent alone, that of every agent, the agent of every city, or both; "joint" for
             distances in the joint network, and its optimiser; "refinement" for what may follow its imitation.
         minutes: training time of each variant and seed on one thread, the labelling of its instances included.
+        steps: optimiser steps of each variant and seed, instead of the time: all of them then learn from the same
+            labelled instances, and results of different machines can be compared. Not for variants with several stages.
         seeds: seeds of the training; every variant is trained once with each. The instances that variants are compared
             on are never trained on.
         folder: folder of the runs; stages that are finished there are not trained again.
@@ -103,18 +106,23 @@ def main(
         out: file for the table in Markdown; by default the study's file in benchmarks/results.
 
     Raises:
-        ValueError: ``minutes`` is not a finite number above 0, there are no seeds, or a file in one of the folders is
-            damaged.
+        ValueError: ``minutes`` is not a finite number above 0, ``steps`` is below 1 or given for variants with several
+            stages, there are no seeds, or a file in one of the folders is damaged.
     """
     check_seconds("minutes", minutes, unit="minutes")
+    if steps is not None:
+        check_count("steps", steps, minimum=1)
+        if any(len(variant.stages) > 1 for variant in STUDIES[study]):
+            raise ValueError(f"steps must be None for the study {study!r}, whose variants have stages, got {steps}")
+    budget = Budget(minutes) if steps is None else Budget(steps, "steps")
     if not seeds:
         raise ValueError("name at least one seed")
     measured = []
     for seed in seeds:  # a whole table for each seed, should the time end early
         for variant in STUDIES[study]:
-            file = result_file(variant, minutes, seed, results)
-            measured.append({"seed": seed, "name": variant.name} | _result(variant, minutes, seed, folder, file))
-            write_text(out or RESULTS / _file_name(study), _report(study, minutes, seeds, measured))
+            file = result_file(variant, budget, seed, results)
+            measured.append({"seed": seed, "name": variant.name} | _result(variant, budget, seed, folder, file))
+            write_text(out or RESULTS / _file_name(study), _report(study, budget, seeds, measured))
     print(to_markdown(measured))
 
 
@@ -122,43 +130,43 @@ def _file_name(study: Study) -> str:
     return "ablations.md" if study == "dan" else f"ablations-{study}.md"
 
 
-def stage_folders(variant: Variant, minutes: float, seed: int, folder: Path) -> list[Path]:
+def stage_folders(variant: Variant, budget: Budget, seed: int, folder: Path) -> list[Path]:
     """The folder of each stage's run. Those of the first stages are the same for variants that begin alike."""
     folders = [folder / variant.learner / f"seed-{seed}"]
     for stage, share in variant.stages:
-        folders.append(folders[-1] / f"{stage}-{share * minutes:g}-minutes")
+        folders.append(folders[-1] / f"{stage}-{budget.part(share)}")
     return folders[1:]
 
 
-def result_file(variant: Variant, minutes: float, seed: int, results: Path) -> Path:
+def result_file(variant: Variant, budget: Budget, seed: int, results: Path) -> Path:
     """The file with the result of a variant and seed."""
-    stages = [f"{stage}-{share * minutes:g}" for stage, share in variant.stages]
+    stages = [f"{stage}-{budget.part(share)}" for stage, share in variant.stages]
     return results / f"{'_'.join([variant.learner, *stages])}_seed-{seed}.json"
 
 
-def _result(variant: Variant, minutes: float, seed: int, folder: Path, file: Path) -> dict[str, Any]:
+def _result(variant: Variant, budget: Budget, seed: int, folder: Path, file: Path) -> dict[str, Any]:
     """What ``train_and_evaluate`` returns for a variant and seed, and where; from ``file`` if it exists."""
     if not file.exists():
-        print(f"{variant.name}, seed {seed}: {minutes:g} minutes", flush=True)
+        print(f"{variant.name}, seed {seed}: {budget}", flush=True)
         spawn = multiprocessing.get_context("spawn")  # a process for each: memory left by one slows no other
         with ProcessPoolExecutor(1, spawn, end_with_parent) as pool:
-            result = pool.submit(train_and_evaluate, variant, minutes, seed, folder).result()
+            result = pool.submit(train_and_evaluate, variant, budget, seed, folder).result()
         write_text(file, json.dumps(result | {"processor": describe_machine()["processor"]}))
     return read_json(file, keys=("steps", "seconds", "weights", "gaps", "processor"))
 
 
-def train_and_evaluate(variant: Variant, minutes: float, seed: int, folder: Path) -> dict[str, Any]:
+def train_and_evaluate(variant: Variant, budget: Budget, seed: int, folder: Path) -> dict[str, Any]:
     """Train a variant; returns the steps of its stages, its seconds and number of weights, and its gaps on each cell.
 
     Stages that are finished in ``folder`` are not trained again, and one that was interrupted is continued.
     """
     torch.set_num_threads(1)
     steps, seconds, init = {}, 0.0, None
-    for (stage, share), out in zip(variant.stages, stage_folders(variant, minutes, seed, folder), strict=True):
+    for (stage, share), out in zip(variant.stages, stage_folders(variant, budget, seed, folder), strict=True):
         finished = out / "finished.json"
         if not finished.exists():
-            config = stage_config(stage, variant, 60 * minutes * share, seed, out, init)
-            run = TRAIN[stage](continued(config, 60 * minutes * share))
+            part = budget.part(share)
+            run = TRAIN[stage](continued(stage_config(stage, variant, part, seed, out, init), part))
             write_text(finished, json.dumps({"steps": run.step, "seconds": run.seconds}))
         done = read_json(finished, keys=("steps", "seconds"))
         steps[stage], seconds, init = done["steps"], seconds + done["seconds"], str(out / "last.safetensors")
@@ -171,14 +179,14 @@ def train_and_evaluate(variant: Variant, minutes: float, seed: int, folder: Path
     }
 
 
-def stage_config(stage: Stage, variant: Variant, seconds: float, seed: int, out: Path, init: str | None) -> RunConfig:
+def stage_config(stage: Stage, variant: Variant, budget: Budget, seed: int, out: Path, init: str | None) -> RunConfig:
     """The options of a stage's run, from the weights ``init`` of the stage before it."""
     options: dict[str, Any] = {
         "out": out,
         "init": init,
         "policy": variant.policy,
         "seed": seed,
-        "steps": 10**9,  # the time decides
+        "steps": int(budget.amount) if budget.unit == "steps" else 10**9,  # 10^9: the time decides
         "threads": 1,
         "validation_instances": 2,  # the instances of the table are what counts
         "validate_every": 10**9,
@@ -193,7 +201,7 @@ def stage_config(stage: Stage, variant: Variant, seconds: float, seed: int, out:
     if stage in ("reinforce", "rollout"):
         return replace(REFINE, **options | (ROLLOUT if stage == "rollout" else {}))
     options |= {
-        "anneal_seconds": seconds,
+        "anneal_seconds": 60 * budget.amount if budget.unit == "minutes" else None,
         "next_weight": variant.next_weight,
         "assignment_weight": variant.assignment_weight,
         "optimiser": variant.optimiser,
@@ -203,13 +211,14 @@ def stage_config(stage: Stage, variant: Variant, seconds: float, seed: int, out:
     return ImitateConfig(**options | (IMITATE if stage == "imitate" else REGRETS | {"roll_in": init}))
 
 
-def continued(config: RunConfig, seconds: float) -> RunConfig:
-    """The options of a run that trains for ``seconds`` in total, from its folder's checkpoint if there is one."""
+def continued(config: RunConfig, budget: Budget) -> RunConfig:
+    """The options of a run that trains for ``budget`` in total, from its folder's checkpoint if there is one."""
     file = checkpoint_path(config)
-    if not file.exists():
-        return replace(config, seconds=seconds, resume=False)
-    spent = checkpoint.read(file)["progress"]["seconds"]
-    return replace(config, seconds=max(seconds - spent, 1e-9), resume=True)  # at least one more step
+    resume = file.exists()
+    if budget.unit == "steps":
+        return replace(config, resume=resume)
+    spent = checkpoint.read(file)["progress"]["seconds"] if resume else 0.0
+    return replace(config, seconds=max(60 * budget.amount - spent, 1e-9), resume=resume)  # at least one more step
 
 
 def gaps(network: nn.Module, cell: Cell, decode: Decode) -> list[float]:
@@ -262,16 +271,15 @@ def to_markdown(results: Sequence[dict[str, Any]]) -> str:
     return markdown_table(["gap to best known, %", *heads, *seeds, "minutes", "steps", "weights"], lines)
 
 
-def _report(study: Study, minutes: float, seeds: Sequence[int], results: Sequence[dict[str, Any]]) -> str:
+def _report(study: Study, budget: Budget, seeds: Sequence[int], results: Sequence[dict[str, Any]]) -> str:
     processors = " and ".join(sorted({result["processor"] for result in results}))
     done = sorted({result["seed"] for result in results})
-    command = (
-        f"python -m benchmarks ablations --study {study} --minutes {minutes:g} --seeds {' '.join(map(str, seeds))}"
-    )
+    options = f"--study {study} --{budget.unit} {budget.amount:g} --seeds {' '.join(map(str, seeds))}"
     return (
-        f"# Ablations\n\nEach variant was trained for {minutes:g} minutes on one thread ({processors}), "
+        f"# Ablations\n\nEach variant was trained for {budget.amount:g} {budget.unit} on one thread ({processors}), "
         f"labelling included, on n in {list(SIZES['n_nodes'])} and m in {list(SIZES['n_agents'])}, with seed "
         f"{' and '.join(map(str, done))}: {NOTES[study]}. Mean gap to the best known tours of Table 1's "
         f"{CELLS[0].count} instances in each column (n, m), ± standard error over the instances. A few trainings say "
-        f"little about small differences. Made by `{command}`.\n\n{to_markdown(results)}\n"
+        f"little about small differences. Made by `python -m benchmarks ablations {options}`.\n\n"
+        f"{to_markdown(results)}\n"
     )

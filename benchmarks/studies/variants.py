@@ -13,12 +13,30 @@ baseline, or with the greedy rollout baseline; self-improvement; imitation with 
 
 
 @dataclass(frozen=True)
+class Budget:
+    """How long a variant or one of its stages is trained.
+
+    Steps give every variant the same labelled instances, however fast the machine is; minutes include the labelling.
+    """
+
+    amount: float
+    unit: Literal["minutes", "steps"] = "minutes"
+
+    def __str__(self) -> str:
+        return f"{self.amount:g}-{self.unit}"
+
+    def part(self, share: float) -> Budget:
+        """That share of it."""
+        return replace(self, amount=share * self.amount)
+
+
+@dataclass(frozen=True)
 class Variant:
     """A network and how it is trained.
 
     Attributes:
         name: its name in the table.
-        stages: kinds of training, one after the other, each with its share of the time.
+        stages: kinds of training, one after the other, each with its share of the budget.
         network: differences from the shipped configuration of the network, for the policies dan and joint.
         policy: the network, as ``RunConfig.policy`` takes it.
         next_weight: weight of the other agents' next nodes in the loss of what imitates tours.
