@@ -113,6 +113,34 @@ def test_the_policys_loss_is_the_same_with_and_without_plans(decisions):
     assert dense.next > 0 and dense.assignment > 0 and plain.next == plain.assignment == 0
 
 
+@pytest.mark.parametrize("labels", ["actions", "plans", "targets"])
+def test_no_label_leaves_it_to_the_rule_to_keep_agents_out(decisions, labels):
+    """By "final", nobody may go home at the first three decisions. The losses fall if the depot is less likely."""
+
+    class Fixed(torch.nn.Module):
+        in_keys = ("cities", "agents", "visited")
+
+        def __init__(self):
+            super().__init__()
+            self.logits = torch.nn.Parameter(torch.zeros(6, 3, 6))
+
+        def forward(self, cities, agents, visited):
+            return self.logits[:, 0]
+
+        def forward_dense(self, *observation):
+            return DenseLogits(self.logits[:, 0], None, None)
+
+    assert decisions["action_mask"][:, 0].tolist() == [False, False, False, True, True, True]
+    given = decisions if labels == "plans" else decisions.exclude("plan")
+    if labels == "targets":
+        given = given.set("target", torch.nn.functional.one_hot(given["action"], 6).float())
+    network = Fixed()
+    imitation_losses(network, given, TINY).total.backward()
+    slope = network.logits.grad[:, 0]
+    assert (slope[:3, 0] > 0).all()
+    assert torch.equal(slope == 0, decisions["visited"])  # visited cities are nothing to learn about
+
+
 @pytest.mark.slow
 def test_dan_learns_who_visits_each_city():
     dan = DANConfig(embed_dim=16, feedforward_dim=32, n_heads=2, city_layers=1, prune_visited=True, assignment=True)

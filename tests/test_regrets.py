@@ -18,6 +18,7 @@ from train.buffer import Buffer
 from train.demonstrations import demonstrate
 from train.imitate import ImitationLearner, imitate
 from train.network import make_network
+from train.plans import learnable_nodes
 from train.regrets import GREATEST_REGRET, Corrections, game_regrets, improved
 from train.supervised import imitation_losses
 
@@ -166,7 +167,7 @@ def test_the_loss_is_0_if_the_targets_are_met_and_falls_as_they_are_learnt(regre
     learner = make_network(config)
     met = batch.clone()
     logits = learner(*(met[key] for key in learner.in_keys)).detach()
-    met["target"] = logits.masked_fill(~met["action_mask"], -torch.inf).softmax(-1)
+    met["target"] = logits.masked_fill(~learnable_nodes(met), -torch.inf).softmax(-1)
     assert imitation_losses(learner, met, config).total.item() == pytest.approx(0.0, abs=1e-5)
     optimiser = torch.optim.Adam(learner.parameters(), lr=1e-3)
     losses = []

@@ -154,15 +154,20 @@ def _costs_of_tours(
     return cost
 
 
-def policy_log_probs(logits: Tensor, decisions: TensorDictBase) -> Tensor:
-    """(N, n) Log-probabilities of the deciding agent's next node.
+def learnable_nodes(decisions: TensorDictBase) -> Tensor:
+    """(N, n) bool: the nodes among which the deciding agent's next one is learnt, the legal ones and the depot.
 
-    The depot counts as legal, also if the rule forbids it. A network that relied on the mask of "final", which keeps
-    the last agent from going home while there are cities, would go home too early by another rule.
+    A network that relied on the mask of "final", which keeps the last agent from going home while there are cities,
+    would go home too early by another rule.
     """
-    legal = decisions["action_mask"].clone()
-    legal[:, 0] = True
-    return logits.float().masked_fill(~legal, -torch.inf).log_softmax(1)
+    nodes = decisions["action_mask"].clone()
+    nodes[:, 0] = True
+    return nodes
+
+
+def policy_log_probs(logits: Tensor, decisions: TensorDictBase) -> Tensor:
+    """(N, n) Log-probabilities of the deciding agent's next node, -inf at what is not learnable."""
+    return logits.float().masked_fill(~learnable_nodes(decisions), -torch.inf).log_softmax(1)
 
 
 def _deciding(decisions: TensorDictBase) -> Tensor:

@@ -15,7 +15,7 @@ from dan_policy.layers import DenseLogits
 from train.collect import autocast
 from train.learner import Learner
 from train.optimisers import make_optimiser
-from train.plans import match_plans, plan_losses, policy_log_probs
+from train.plans import learnable_nodes, match_plans, plan_losses, policy_log_probs
 from train.supervised_config import SupervisedConfig
 
 
@@ -113,8 +113,8 @@ def imitation_losses(network: nn.Module, decisions: TensorDictBase, config: Supe
 def _target_losses(network: nn.Module, decisions: TensorDictBase) -> ImitationLosses:
     """The mean divergence of the policy from ``target`` [N, n] of each decision: 0 if it has learnt them."""
     logits: Tensor = network(*(decisions.get(key, None) for key in network_keys(network)))
-    legal, target = decisions["action_mask"], decisions["target"]
-    log_prob = logits.float().masked_fill(~legal, -torch.inf).log_softmax(1).masked_fill(~legal, 0.0)
+    target = decisions["target"]
+    log_prob = policy_log_probs(logits, decisions).masked_fill(~learnable_nodes(decisions), 0.0)  # 0 times -inf is NaN
     loss = (torch.special.xlogy(target, target) - target * log_prob).sum(1).mean()
     likeliest = log_prob.detach().gather(1, target.argmax(1, keepdim=True))
     nothing = loss.new_zeros(())
