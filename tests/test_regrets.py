@@ -194,9 +194,9 @@ def test_a_run_resumes_bit_for_bit_and_workers_make_the_same_sets(tmp_path, monk
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"labels": "costs"}, "labels must be 'tours' or 'regrets', got 'costs'"),
+        ({"labels": "costs"}, "labels must be 'tours', 'regrets' or 'policy', got 'costs'"),
         ({"regret_temperature": 0.0}, "regret_temperature must be finite and above 0, got 0.0"),
-        ({"roll_in": None}, "labels='regrets' needs a student in roll_in, .* got None"),
+        ({"roll_in": None}, "labels='regrets' needs a network in roll_in, .* got None"),
         ({"scenario": ("team",)}, r"labels='regrets' needs .* got .*, \('team',\)"),
         ({"plan_matching": "invariant"}, "labels='regrets' needs .* 'invariant'"),
         ({"passes": 0.0}, "passes must be above 0 and at most 100, got 0.0"),

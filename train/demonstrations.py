@@ -27,6 +27,7 @@ from mtsp_env.distributions import sample
 from mtsp_env.instance import Problem, Tours
 from train.canonical import canonical
 from train.collect import autocast, draw_scenario, draw_size, environment, present, rotated
+from train.distillation import distil
 from train.lessons import Lessons, teach
 from train.network import student
 from train.regrets import Corrections, correct
@@ -46,8 +47,6 @@ class Demonstrations(NamedTuple):
 
 def demonstrate(config: ImitateConfig, index: int) -> Demonstrations | Lessons | Corrections:
     """The ``index``-th set of a run. It depends on ``config`` and ``index`` alone, not on the process that makes it."""
-    from mtsp_env.reference import improve_batch  # imports Numba, which only the teacher needs
-
     rng = np.random.default_rng([config.seed, index])
     scenario = config.world(draw_scenario(rng, config))
     n_nodes, n_agents = draw_size(rng, config)
@@ -61,6 +60,10 @@ def demonstrate(config: ImitateConfig, index: int) -> Demonstrations | Lessons |
         return teach(config, rng, problem)
     if config.labels == "regrets":
         return correct(config, rng, problem)
+    if config.labels == "policy":
+        return distil(config, problem)
+    from mtsp_env.reference import improve_batch  # imports Numba, which only the teacher needs
+
     nodes = problem.nodes
     seed = int(rng.integers(2**31))
     begin = 0 if config.roll_in is None else int(rng.integers(n_nodes - 1))  # every game takes n - 1 decisions or more

@@ -63,7 +63,7 @@ def correct(config: ImitateConfig, rng: np.random.Generator, problem: Problem) -
         rng: draws the teacher's seeds and the other decisions.
         problem: a batch of plain instances.
     """
-    observation, prior, chosen, valid = _play(config, problem)
+    observation, prior, chosen, valid = student_games(config, problem)
     regret = np.full(prior.shape, np.inf, np.float32)
     for row, seed in enumerate(rng.integers(2**31, size=len(problem.nodes)).tolist()):
         instance = Instance(np.asarray(problem.nodes[row]), problem.n_agents)
@@ -106,8 +106,14 @@ def improved(prior: np.ndarray, regret: np.ndarray, temperature: float) -> tuple
     return target.astype(np.float32), expected
 
 
-def _play(config: ImitateConfig, problem: Problem) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray]:
-    """The student's games: observations (T, B, ...), its probabilities (T, B, n), actions (T, B), valid (T, B)."""
+def student_games(
+    config: ImitateConfig, problem: Problem
+) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray]:
+    """Greedy games of ``config.roll_in``.
+
+    Returns:
+        Its observations (T, B, ...) by their keys, its probabilities (T, B, n), its actions (T, B), and valid (T, B).
+    """
     config = replace(config, device="cpu")  # the teacher runs there
     env, actor = environment(problem, config), student(config)
     keys = [key for key in env.observation_spec.keys() if key != "game"]  # noqa: SIM118 (no dict)

@@ -95,15 +95,15 @@ class ImitateConfig(SupervisedConfig):
     buffer: int = 16
     """Number of sets to draw from at a time."""
     passes: float = 1.0
-    """Share of a set's decision indices that are used before a fresh set replaces it, at most 1. With `labels` regrets,
-    how often each of its decisions is used."""
+    """Share of a set's decision indices that are used before a fresh set replaces it, at most 1. With `labels` regrets
+    or policy, how often each of its decisions is used."""
     roll_in: str | None = None
     """Weights of a student (a file, or a shipped model's name) that plays a random number of decisions at the beginning
     of each game; the teacher shows how to continue (DAgger), and the next decisions are learnt from, a share `passes`
-    of the set's. With `labels` regrets, the student plays whole games. None: the teacher plays whole games."""
-    labels: Literal["tours", "regrets"] = "tours"
-    """What is learnt: the teacher's tours; or how much each of the student's likely next nodes costs in its own games,
-    as the teacher sees it (regrets)."""
+    of the set's. With `labels` regrets or policy, this network plays whole games. None: the teacher plays them."""
+    labels: Literal["tours", "regrets", "policy"] = "tours"
+    """What is learnt: the teacher's tours; how much each of the student's likely next nodes costs in its own games, as
+    the teacher sees it (regrets); or the probabilities of the network in `roll_in` in its own games (policy)."""
     regret_temperature: float = 0.01
     """With `labels` regrets: a node whose makespan exceeds that of the best node by this share should lose a factor of
     e in probability, compared with the best one."""
@@ -127,8 +127,8 @@ class ImitateConfig(SupervisedConfig):
             raise ValueError(f"n_nodes[0] must be above n_agents[0]={self.n_agents[0]}, got {self.n_nodes[0]}")
         if self.sets_per_step > self.buffer:
             raise ValueError(f"sets_per_step must be at most buffer={self.buffer}, got {self.sets_per_step}")
-        if self.labels not in ("tours", "regrets"):
-            raise ValueError(f"labels must be 'tours' or 'regrets', got {self.labels!r}")
+        if self.labels not in ("tours", "regrets", "policy"):
+            raise ValueError(f"labels must be 'tours', 'regrets' or 'policy', got {self.labels!r}")
         if not 0 < self.regret_temperature < math.inf:
             raise ValueError(f"regret_temperature must be finite and above 0, got {self.regret_temperature!r}")
         if self.labels == "tours":
@@ -137,8 +137,8 @@ class ImitateConfig(SupervisedConfig):
             raise ValueError(f"passes must be above 0 and at most 100, got {self.passes!r}")
         elif self.roll_in is None or self.scenario != ("plain",) or self.plan_matching != "canonical":
             raise ValueError(
-                "labels='regrets' needs a student in roll_in, scenario ('plain',) and plan_matching 'canonical', got "
-                f"{self.roll_in!r}, {self.scenario} and {self.plan_matching!r}"
+                f"labels={self.labels!r} needs a network in roll_in, scenario ('plain',) and plan_matching "
+                f"'canonical', got {self.roll_in!r}, {self.scenario} and {self.plan_matching!r}"
             )
         if self.plan_matching == "invariant" and self.scenario != ("plain",):
             raise ValueError(
