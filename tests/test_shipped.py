@@ -9,13 +9,14 @@ from mtsp_env import uniform
 
 
 def runs_of(extra: dict) -> list[dict]:
-    """The runs whose weights were averaged, also if averages were averaged again."""
-    parts = extra.get("averaged")
-    return [extra] if parts is None else [run for part in parts for run in runs_of(part)]
+    """The runs behind the weights: those whose weights were averaged, and what a run started from."""
+    parts = extra.get("averaged", [])
+    parts += [extra["started_from"]] if "started_from" in extra else []
+    return [run for part in parts for run in runs_of(part)] + ([extra] if "step" in extra else [])
 
 
 @pytest.mark.parametrize("name", ["default", "dan"])
-def test_the_card_names_every_run_behind_a_mean_of_weights(name):
+def test_the_card_names_every_run_behind_the_weights(name):
     card = (registry.SHIPPED / "README.md").read_text().split(f"## `{name}`")[1].split("\n## ")[0]
     runs = runs_of(registry.load_extra(name))
     assert len(runs) > 2
