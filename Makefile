@@ -10,7 +10,7 @@ INSTALL := $(PIP) install --quiet --constraint constraints.txt
 
 # Plans the tours of the examples with the shipped network and says where the pictures are.
 demo: $(VENV)/.demo
-	$(BIN)/mtsp solve examples/*.tsp --agents 4 --augment --plot tours.png
+	$(BIN)/mtsp solve examples/*.tsp --agents 4 --augment --reconstruct 16 --plot tours.png
 
 # The whole test suite on all cores.
 test: $(VENV)/.dev
