@@ -211,6 +211,8 @@ def test_steps_are_for_variants_with_one_stage(tmp_path):
     with pytest.raises(ValueError, match="steps must be"):
         ablations.main("joint", steps=0, folder=tmp_path / "runs", out=tmp_path / "table.md")
     (variant,) = ablations.STUDIES["dense-labels"][:1]
+    table = ablations._report("dense-labels", Budget(1_234_567, "steps"), (0,), [])
+    assert "for 1234567 steps on one thread" in table and "--steps 1234567" in table and "labelling" not in table
     config = ablations.stage_config("imitate", variant, Budget(7, "steps"), 0, tmp_path, None)
     assert config.steps == 7 and config.anneal_seconds is None and config.seconds is None
 

@@ -48,6 +48,8 @@ def test_environments_fit_the_world_and_its_depot_rule():
         assert env.rules.depot == ("final" if scenario == "plain" else "wait")
         assert env is environment(draw(rng, WORLD, 3, size=(8, 2), scenario=scenario), WORLD)  # built once
     assert environment(problem, replace(WORLD, world_depot="open")).rules.depot == "open"
+    plain = draw(rng, WORLD, 3, size=(8, 2), scenario="plain")
+    assert environment(plain, replace(WORLD, depot="wait")).rules.depot == "wait"
 
 
 def test_a_scenario_of_ones_own():

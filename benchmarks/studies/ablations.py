@@ -274,10 +274,11 @@ def to_markdown(results: Sequence[dict[str, Any]]) -> str:
 def _report(study: Study, budget: Budget, seeds: Sequence[int], results: Sequence[dict[str, Any]]) -> str:
     processors = " and ".join(sorted({result["processor"] for result in results}))
     done = sorted({result["seed"] for result in results})
-    options = f"--study {study} --{budget.unit} {budget.amount:g} --seeds {' '.join(map(str, seeds))}"
+    labelling = ", labelling included," if budget.unit == "minutes" else ""
+    options = f"--study {study} --{budget.unit} {budget.number} --seeds {' '.join(map(str, seeds))}"
     return (
-        f"# Ablations\n\nEach variant was trained for {budget.amount:g} {budget.unit} on one thread ({processors}), "
-        f"labelling included, on n in {list(SIZES['n_nodes'])} and m in {list(SIZES['n_agents'])}, with seed "
+        f"# Ablations\n\nEach variant was trained for {budget.number} {budget.unit} on one thread ({processors})"
+        f"{labelling} on n in {list(SIZES['n_nodes'])} and m in {list(SIZES['n_agents'])}, with seed "
         f"{' and '.join(map(str, done))}: {NOTES[study]}. Mean gap to the best known tours of Table 1's "
         f"{CELLS[0].count} instances in each column (n, m), ± standard error over the instances. A few trainings say "
         f"little about small differences. Made by `python -m benchmarks ablations {options}`.\n\n"

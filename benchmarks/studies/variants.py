@@ -23,7 +23,12 @@ class Budget:
     unit: Literal["minutes", "steps"] = "minutes"
 
     def __str__(self) -> str:
-        return f"{self.amount:g}-{self.unit}"
+        return f"{self.number}-{self.unit}"
+
+    @property
+    def number(self) -> str:
+        """The amount without rounding errors such as those of 0.7 * 60."""
+        return f"{self.amount:.12g}"
 
     def part(self, share: float) -> Budget:
         """That share of it."""
