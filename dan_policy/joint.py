@@ -6,7 +6,8 @@ The policy stays decentralised: one agent's observation in, logits of that agent
 
 A transformer that is given coordinates has to learn what is near. With ``JointConfig.distances``, each head adds a
 learned multiple of the distance between two tokens to its attention scores, as ALiBi does along a text (Press et al.
-2022) and ICAM for routing (Zhou et al. 2024). The logits get such a term as well.
+2022) and ICAM for routing (Zhou et al. 2024). The logits get such a term as well. With ``JointConfig.polar``, each
+token is also given its distance from the decider, and its distance and direction from the depot.
 
 In worlds it can read further keys (``JointConfig.reads``). Each adds a learned vector to some tokens, times how far the
 value is from its neutral one. The vectors begin as zero, so that weights without them go on as they are; a key that an
@@ -53,8 +54,8 @@ class JointConfig:
 
     Raises:
         ValueError: a size below 1 or beyond ``layers.GREATEST``, a number of heads that does not divide the width, a
-            clip that is not above 0 or beyond ``layers.GREATEST_CLIP``, a view below 1, distances that are not
-            a bool, or keys to read that are unknown or named twice.
+            clip that is not above 0 or beyond ``layers.GREATEST_CLIP``, a view below 1, distances or polar that are
+            not a bool, or keys to read that are unknown or named twice.
     """
 
     embed_dim: int = 128  # d
@@ -64,6 +65,7 @@ class JointConfig:
     tanh_clip: float = 10.0  # C: logits lie in [-C, C]
     view: int | None = None  # see at most this many cities, the nearest unvisited ones; None: all of them
     distances: bool = False  # attention scores and logits depend on the distances between tokens
+    polar: bool = False  # tokens know their distance from the decider, and their distance and direction from the depot
     reads: tuple[str, ...] = ()  # keys of observations in worlds that it reads as well, of READABLE
 
     def __post_init__(self) -> None:
@@ -73,8 +75,9 @@ class JointConfig:
         check_clip(self.tanh_clip)
         if self.view is not None and not (type(self.view) is int and self.view >= 1):
             raise ValueError(f"view must be None or at least 1 city, got {self.view!r}")
-        if type(self.distances) is not bool:
-            raise ValueError(f"distances must be True or False, got {self.distances!r}")
+        for name in ("distances", "polar"):
+            if type(getattr(self, name)) is not bool:
+                raise ValueError(f"{name} must be True or False, got {getattr(self, name)!r}")
         keys = list(self.reads) if isinstance(self.reads, (list, tuple)) else [self.reads]
         if not all(key in READABLE for key in map(str, keys)) or len(set(keys)) < len(keys):
             raise ValueError(f"reads must be different keys of {list(READABLE)}, got {self.reads!r}")
@@ -96,6 +99,8 @@ class JointDAN(nn.Module):
         self.embed_depot = nn.Linear(2, d)
         self.embed_city = nn.Linear(2, d)
         self.embed_agent = nn.Linear(3, d)
+        if config.polar:
+            self.embed_polar = nn.Linear(4, d, bias=False)
         self.decider = nn.Parameter(torch.randn(d) / 2)  # added to the deciding agent's token
         self.layers = nn.ModuleList(
             AttentionLayer(d, config.feedforward_dim, config.n_heads, "pre") for _ in range(config.n_layers)
@@ -165,6 +170,8 @@ class JointDAN(nn.Module):
         decides = torch.arange(m, device=agent.device) == agent[:, None]  # (B, m)
         h_agents = self.embed_agent(agents) + decides[:, :, None] * self.decider
         h = torch.cat([h_agents, self.embed_depot(seen[:, :1]), self.embed_city(seen[:, 1:])], dim=1)  # (B, m + k, d)
+        if self.config.polar:
+            h = h + self.embed_polar(polar_coordinates(torch.cat([agents[:, :, :2], seen], dim=1), seen[:, :1]))
         for key, values in zip(self.config.reads, extra, strict=False):
             if values is not None:
                 h = h + self._effect(key, values.reshape(len(h), -1), in_view, m)
@@ -230,6 +237,23 @@ def token_distances(agents: Tensor, nodes: Tensor, n_nodes: Tensor) -> Tensor:
     between[:, :, :m] += remaining[:, None]
     between.diagonal(dim1=1, dim2=2).zero_()
     return between * n_nodes.to(between.dtype).sqrt()[:, None, None]
+
+
+def polar_coordinates(positions: Tensor, depot: Tensor) -> Tensor:
+    """Distances from the decider, and distances and directions from the depot.
+
+    Args:
+        positions: (B, k, 2), relative to the decider.
+        depot: (B, 1, 2), likewise.
+
+    Returns:
+        (B, k, 4): the distance from the decider, that from the depot, and the cosine and sine of the direction in which
+        the depot sees the position; both 0 at the depot itself.
+    """
+    away = positions - depot
+    from_depot = away.square().sum(2, keepdim=True).sqrt()
+    direction = away / from_depot.clamp(min=1e-9)
+    return torch.cat([positions.square().sum(2, keepdim=True).sqrt(), from_depot, direction], dim=2)
 
 
 def _rows(cities: Tensor, agents: Tensor, visited: Tensor, agent: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dan_policy import layers
-from dan_policy.joint import JointConfig, JointDAN, token_distances
+from dan_policy.joint import JointConfig, JointDAN, polar_coordinates, token_distances
 
 SMALL = JointConfig(embed_dim=16, feedforward_dim=32, n_heads=2, n_layers=2)
 CONFIGS = {
@@ -14,6 +14,7 @@ CONFIGS = {
     "default": JointConfig(),
     "short-sighted": replace(SMALL, view=3),
     "distances": replace(SMALL, distances=True),
+    "polar": replace(SMALL, distances=True, polar=True),
 }
 
 
@@ -23,7 +24,7 @@ def network(request):
     return JointDAN(CONFIGS[request.param]).eval()
 
 
-@pytest.fixture(params=["small", "distances"])
+@pytest.fixture(params=["small", "distances", "polar"])
 def small(request):
     torch.manual_seed(0)
     return JointDAN(CONFIGS[request.param]).eval()
@@ -181,6 +182,13 @@ def test_distances_of_a_case_solved_by_hand():
     assert torch.allclose(distances[0], expected)
 
 
+def test_polar_coordinates_of_a_case_solved_by_hand():
+    """The decider is two units east of the depot."""
+    positions = torch.tensor([[[-2.0, 0.0], [0.0, 0.0], [-2.0, -3.0], [1.0, 4.0]]])
+    expected = torch.tensor([[2, 0, 0, 0], [0, 2, 1, 0], [13**0.5, 3, 0, -1], [17**0.5, 5, 0.6, 0.8]])
+    assert torch.allclose(polar_coordinates(positions, positions[:, :1])[0], expected)
+
+
 def test_without_slopes_distances_have_no_effect():
     torch.manual_seed(0)
     plain, network = JointDAN(SMALL), JointDAN(replace(SMALL, distances=True))
@@ -223,6 +231,7 @@ def test_the_default_has_about_a_million_parameters():
         ({"tanh_clip": 0.0}, r"tanh_clip must be a number above 0 and at most 1e\+06, got 0.0"),
         ({"view": 0}, "view must be None or at least 1 city, got 0"),
         ({"distances": 1}, "distances must be True or False, got 1"),
+        ({"polar": "yes"}, "polar must be True or False, got 'yes'"),
         ({"reads": ("moon",)}, r"reads must be different keys of \['agent_speeds', .*\], got \('moon',\)"),
         ({"reads": ("service", "service")}, r"reads must be different keys"),
     ],

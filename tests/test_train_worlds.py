@@ -129,17 +129,19 @@ def test_weights_start_to_read_with_no_effect(tmp_path):
         make_network(replace(config, policy="dan", init="dan", reads=("service",)))
 
 
-def test_weights_start_to_use_distances_with_no_effect(tmp_path):
+@pytest.mark.parametrize(("option", "added"), [("distances", "distance_slopes"), ("polar", "embed_polar.weight")])
+def test_weights_start_to_use_distances_with_no_effect(tmp_path, option, added):
     torch.manual_seed(6)
     save(tmp_path / "plain.safetensors", JointDAN(JOINT))
     config = replace(WORLD, init=str(tmp_path / "plain.safetensors"))
-    network, plain = make_network(replace(config, distances=True)), make_network(config)
-    assert network.config == replace(plain.config, distances=True)
-    assert network.distance_slopes.shape == (1, 2) and not network.distance_slopes.any()
+    network, plain = make_network(replace(config, **{option: True})), make_network(config)
+    assert network.config == replace(plain.config, **{option: True})
+    new = network.state_dict().keys() - plain.state_dict().keys()
+    assert added in new and not any(network.state_dict()[name].any() for name in new)
     observation = BatchedMTSP(12, 3, [8], seed=0).reset()
     keys = [observation.get(key, None) for key in network.in_keys]
     assert torch.allclose(network(*keys), plain(*keys), atol=1e-5)
-    save(tmp_path / "distances.safetensors", network)
-    assert load(tmp_path / "distances.safetensors").config.distances
-    with pytest.raises(ValueError, match=r"would leave out weights .*'assignment_slope', 'distance_slopes'"):
-        make_network(replace(config, init=str(tmp_path / "distances.safetensors"), distances=False))
+    save(tmp_path / "new.safetensors", network)
+    assert getattr(load(tmp_path / "new.safetensors").config, option)
+    with pytest.raises(ValueError, match=f"would leave out weights .*'{added}'"):
+        make_network(replace(config, init=str(tmp_path / "new.safetensors"), **{option: False}))

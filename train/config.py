@@ -14,7 +14,7 @@ from dan_policy.registry import NETWORKS
 from mtsp_env.checks import check_count, check_seconds
 from mtsp_env.distributions import Generator, check_distribution, check_scenario
 
-OVERRIDES = ("prune_visited", "reads", "distances")
+OVERRIDES = ("prune_visited", "reads", "distances", "polar")
 """Options of a network that a run may change in the weights of ``init``."""
 
 
@@ -77,6 +77,9 @@ class RunConfig:
     distances: bool | None = None
     """With `init`: override whether the attention and the logits of the joint network depend on distances. At first
     they have no effect."""
+    polar: bool | None = None
+    """With `init`: override whether the tokens of the joint network know their distance from the decider, and their
+    distance and direction from the depot. At first this has no effect."""
     max_grad_norm: float = 1.0
     """Gradients are scaled down to this norm if theirs is larger."""
     average: float = 0.0

@@ -94,7 +94,8 @@ def main(
     Args:
         study: "dan" for parts of DAN and of its training, "dense-labels" for networks and what they are taught: the
             next node of the deciding agent alone, that of every agent, the agent of every city, or both; "joint" for
-            distances in the joint network, and its optimiser; "refinement" for what may follow its imitation.
+            distances and polar coordinates in the joint network, and its optimiser; "refinement" for what may follow
+            its imitation.
         minutes: training time of each variant and seed on one thread, the labelling of its instances included.
         steps: optimiser steps of each variant and seed, instead of the time: all of them then learn from the same
             labelled instances, and results of different machines can be compared. Not for variants with several stages.

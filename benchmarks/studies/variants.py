@@ -98,6 +98,7 @@ DENSE_LABELS = (
 JOINT_VARIANTS = (
     _JOINT,
     replace(_JOINT, name="joint, distances", network={"distances": True}),
+    replace(_JOINT, name="joint, distances, polar coordinates", network={"distances": True, "polar": True}),
     replace(_JOINT, name="joint, Muon", optimiser="muon"),
     replace(_JOINT, name="joint, distances, Muon", network={"distances": True}, optimiser="muon"),
 )
