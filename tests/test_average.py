@@ -8,6 +8,7 @@ import torch
 from safetensors.torch import save_file
 
 from dan_policy import DAN, DANConfig, load, save
+from dan_policy.joint import JointConfig, JointDAN
 from dan_policy.registry import load_extra
 from train.__main__ import main
 from train.presets import REFINE
@@ -45,6 +46,31 @@ def test_shares_carry_over_what_a_run_has_learnt(files, tmp_path):
     for name, weight in summed.items():
         assert torch.allclose(weight, a[name] + 0.5 * (b[name] - c[name]), atol=1e-6), name
     assert load_extra(out)["shares"] == [1.0, 0.5, -0.5]
+
+
+@pytest.mark.slow
+def test_weights_that_a_network_lacks_count_as_zero(tmp_path):
+    """One network has distances, another reads service times, and a third both; whichever comes first."""
+    torch.manual_seed(0)
+    plain = JointConfig(embed_dim=16, feedforward_dim=32, n_heads=2, n_layers=1)
+    both = replace(plain, distances=True, reads=("service",))
+    for name, config in (("plain", plain), ("distances", replace(plain, distances=True)), ("both", both)):
+        save(tmp_path / f"{name}.safetensors", JointDAN(config), step=name)
+    for order in (["plain", "both", "distances"], ["distances", "plain", "both"]):
+        files, out = [str(tmp_path / f"{name}.safetensors") for name in order], tmp_path / "mean.safetensors"
+        assert main(["average", *files, "--shares", "0.25", "0.25", "0.5", "--out", str(out)]) == 0
+        mean, states = load(out), [load(file).state_dict() for file in files]
+        assert mean.config == both
+        for name, weight in mean.state_dict().items():
+            parts = [
+                share * state[name] for share, state in zip((0.25, 0.25, 0.5), states, strict=True) if name in state
+            ]
+            assert torch.allclose(weight, sum(parts), atol=1e-6), name
+        assert [source["step"] for source in load_extra(out)["averaged"]] == order
+    save(tmp_path / "reads.safetensors", JointDAN(replace(plain, reads=("service",))))
+    without_all = [str(tmp_path / f"{name}.safetensors") for name in ("distances", "reads")]
+    assert main(["average", *without_all, "--out", str(tmp_path / "none.safetensors")]) == 2
+    assert not (tmp_path / "none.safetensors").exists()
 
 
 @pytest.mark.parametrize("shares", [("1",), ("0.5", "0.4"), ("1", "1"), ("nan", "1"), ("inf", "-inf")])

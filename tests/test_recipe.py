@@ -58,7 +58,7 @@ name = "refine"
 command = "reinforce"
 preset = "refine"
 share = 0.25
-options = {{steps = 3, batch_size = 2, samples = 3, challenge_instances = 4, warmup = 2}}
+options = {{steps = 3, batch_size = 2, samples = 3, challenge_instances = 4, warmup = 2, distances = true}}
 
 [[stages]]
 name = "improve"
@@ -195,8 +195,10 @@ def test_stages_follow_one_another_and_are_logged(tiny, tmp_path):
         load(out / file).state_dict()
         for file in ("roll-in/best.safetensors", "refine/best.safetensors", "refine/mixed.safetensors")
     )
+    assert mixed.keys() - began.keys() == {"distance_slopes", "next_slope", "assignment_slope"}  # this stage adds them
     for name, parameter in mixed.items():
-        torch.testing.assert_close(parameter, 0.75 * began[name] + 0.25 * best[name])
+        before = began.get(name, torch.zeros_like(parameter))
+        torch.testing.assert_close(parameter, 0.75 * before + 0.25 * best[name])
     with pytest.raises(FileExistsError, match="holds a run already: add --resume"):
         recipe(tiny, out)
     recipe(tiny, out, resume=True)  # nothing is left to do

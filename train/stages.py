@@ -220,7 +220,7 @@ def _final_weights(stage: Stage, config: RunConfig) -> str:
     if stage.share == 1.0 or config.init is None:
         return BEST
     network = config.policy if ":" in config.policy else None
-    average((config.init, str(config.out / BEST)), config.out / MIXED, (1.0 - stage.share, stage.share), network)
+    average((str(config.out / BEST), config.init), config.out / MIXED, (stage.share, 1.0 - stage.share), network)
     return MIXED
 
 
