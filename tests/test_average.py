@@ -73,6 +73,13 @@ def test_weights_that_a_network_lacks_count_as_zero(tmp_path):
     assert not (tmp_path / "none.safetensors").exists()
 
 
+def test_of_networks_with_the_same_weights_the_first_says_whether_visited_cities_are_pruned(files, tmp_path):
+    pruned, out = tmp_path / "pruned.safetensors", tmp_path / "mean.safetensors"
+    save(pruned, DAN(replace(SMALL, prune_visited=not SMALL.prune_visited)))
+    assert main(["average", str(pruned), files[0], "--out", str(out)]) == 0
+    assert load(out).config == load(pruned).config != SMALL
+
+
 @pytest.mark.parametrize("shares", [("1",), ("0.5", "0.4"), ("1", "1"), ("nan", "1"), ("inf", "-inf")])
 def test_shares_that_do_not_add_up_are_refused(files, tmp_path, capsys, shares):
     out = tmp_path / "mean.safetensors"

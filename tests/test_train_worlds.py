@@ -130,7 +130,7 @@ def test_weights_start_to_read_with_no_effect(tmp_path):
 
 
 @pytest.mark.parametrize(("option", "added"), [("distances", "distance_slopes"), ("polar", "embed_polar.weight")])
-def test_weights_start_to_use_distances_with_no_effect(tmp_path, option, added):
+def test_weights_start_to_use_distances_and_polar_coordinates_with_no_effect(tmp_path, option, added):
     torch.manual_seed(6)
     save(tmp_path / "plain.safetensors", JointDAN(JOINT))
     config = replace(WORLD, init=str(tmp_path / "plain.safetensors"))
