@@ -27,6 +27,7 @@ COMMANDS = {
     "memory": "benchmarks.studies.memory:main",
     "sweep-clip": "benchmarks.studies.sweeps:sweep_clip",
     "sweep-view": "benchmarks.studies.sweeps:sweep_view",
+    "sweep-confidence": "benchmarks.studies.sweeps:sweep_confidence",
     "sweep-search": "benchmarks.studies.sweeps:sweep_search",
     "ablations": "benchmarks.studies.ablations:main",
     "worlds": "benchmarks.studies.worlds:main",

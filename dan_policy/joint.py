@@ -9,6 +9,10 @@ learned multiple of the distance between two tokens to its attention scores, as 
 2022) and ICAM for routing (Zhou et al. 2024). The logits get such a term as well. With ``JointConfig.polar``, each
 token is also given its distance from the decider, and its distance and direction from the depot.
 
+Dense supervision teaches it where every agent goes next, not only the decider. With ``JointConfig.confidence``,
+``dan_policy.solve`` lets the agents after the decider act on what is foreseen for them, if that is as good as certain:
+fewer forward passes give the same tours.
+
 In worlds it can read further keys (``JointConfig.reads``). Each adds a learned vector to some tokens, times how far the
 value is from its neutral one. The vectors begin as zero, so that weights without them go on as they are; a key that an
 observation does not have counts as neutral.
@@ -29,6 +33,7 @@ from dan_policy.layers import (
     AttentionLayer,
     DenseLogits,
     check_clip,
+    check_confidence,
     check_sizes,
     open_nodes,
     pointer_logits,
@@ -54,8 +59,8 @@ class JointConfig:
 
     Raises:
         ValueError: a size below 1 or beyond ``layers.GREATEST``, a number of heads that does not divide the width, a
-            clip that is not above 0 or beyond ``layers.GREATEST_CLIP``, a view below 1, distances or polar that are
-            not a bool, or keys to read that are unknown or named twice.
+            clip that is not above 0 or beyond ``layers.GREATEST_CLIP``, a view below 1, a confidence that is not above
+            0 and at most 1, distances or polar that are not a bool, or keys to read that are unknown or named twice.
     """
 
     embed_dim: int = 128  # d
@@ -67,6 +72,7 @@ class JointConfig:
     distances: bool = False  # attention scores and logits depend on the distances between tokens
     polar: bool = False  # tokens know their distance from the decider, and their distance and direction from the depot
     reads: tuple[str, ...] = ()  # keys of observations in worlds that it reads as well, of READABLE
+    confidence: float | None = None  # see ``SolveOptions.confidence``; it needs a network taught what all agents do
 
     def __post_init__(self) -> None:
         check_sizes(self, "embed_dim", "feedforward_dim", "n_heads", "n_layers")
@@ -75,6 +81,7 @@ class JointConfig:
         check_clip(self.tanh_clip)
         if self.view is not None and not (type(self.view) is int and self.view >= 1):
             raise ValueError(f"view must be None or at least 1 city, got {self.view!r}")
+        check_confidence(self.confidence)
         for name in ("distances", "polar"):
             if type(getattr(self, name)) is not bool:
                 raise ValueError(f"{name} must be True or False, got {getattr(self, name)!r}")
@@ -138,6 +145,19 @@ class JointDAN(nn.Module):
         distances = None if distances is None else _gather(distances, agent[:, None])  # (B, 1, k)
         logits = self._next(h_decider, h_nodes, distances)  # (B, 1, k)
         return scatter_nodes(logits, in_view, visited, -self.config.tanh_clip).reshape(*lead, n)
+
+    def forward_next(
+        self, cities: Tensor, agents: Tensor, visited: Tensor, agent: Tensor, *extra: Tensor | None
+    ) -> Tensor:
+        """Logits (..., m, n) of where each agent goes next; the decider's row is the policy.
+
+        Arguments as in ``forward``. At visited nodes and out of view they are -C.
+        """
+        lead, m, n = visited.shape[:-1], agents.shape[-2], visited.shape[-1]
+        cities, agents, visited, agent = _rows(cities, agents, visited, agent)
+        h_agents, h_nodes, in_view, distances = self._encode(cities, agents, visited, agent, extra)
+        logits = self._next(h_agents, h_nodes, distances)  # (B, m, k)
+        return scatter_nodes(logits, in_view, visited, -self.config.tanh_clip).reshape(*lead, m, n)
 
     def forward_dense(
         self, cities: Tensor, agents: Tensor, visited: Tensor, agent: Tensor, *extra: Tensor | None

@@ -32,6 +32,12 @@ def check_clip(value: float) -> None:
         raise ValueError(f"tanh_clip must be a number above 0 and at most {GREATEST_CLIP:g}, got {value!r}")
 
 
+def check_confidence(value: float | None) -> None:
+    """Raise ValueError unless ``value`` can be the confidence of a network: None, or a probability above 0."""
+    if value is not None and (isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value <= 1):
+        raise ValueError(f"confidence must be None, or above 0 and at most 1, got {value!r}")
+
+
 class DenseLogits(NamedTuple):
     """Logits of the policy and, for dense supervision, of what all agents do. None: the network has no such output.
 

@@ -21,6 +21,7 @@ from dan_policy.actor import Network
 from dan_policy.episode import Decode, find_device
 from dan_policy.games import begin, best_tours, play
 from dan_policy.heuristics import bfloat16_pays, default_view, sampling_clip
+from dan_policy.layers import check_confidence
 from dan_policy.reconstruct import GAMES, reconstruct
 from dan_policy.registry import find, load, network_name
 from dan_policy.symmetry import SYMMETRIES
@@ -56,7 +57,9 @@ class Solution:
 
 @dataclass(frozen=True)
 class SolveOptions:
-    """How ``solve`` plans. ``clip``, ``view`` and ``prune_visited`` need a network whose ``config`` has these fields.
+    """How ``solve`` plans.
+
+    ``clip``, ``view``, ``prune_visited`` and ``confidence`` need a network whose ``config`` has these fields.
 
     Attributes:
         decode: "greedy" plays one game of likeliest actions; "sample" plays ``samples`` games of drawn actions and
@@ -80,6 +83,9 @@ class SolveOptions:
             faster. A DAN needs ``prune_visited`` for it. None: the network's own, or else ``heuristics.default_view``,
             which suits networks trained on small instances; one trained on larger ones wants ``view=n_nodes``.
         prune_visited: whether visited cities are dropped before the encoders. None: as the network was trained.
+        confidence: a network that foresees where all agents go next (``JointDAN``) lets the next agents act on that if
+            its probability is above this, at most 1; each of them would look for itself otherwise. 1: each agent always
+            looks for itself. None: as the network's own config says.
 
     Raises:
         ValueError: a value outside its range.
@@ -96,6 +102,7 @@ class SolveOptions:
     clip: float | None = None
     view: int | None = None
     prune_visited: bool | None = None
+    confidence: float | None = None
 
     def __post_init__(self) -> None:
         for name, choices in (("decode", get_args(Decode)), ("precision", get_args(Precision))):
@@ -112,6 +119,7 @@ class SolveOptions:
             raise ValueError(f"clip must be above 0, got {self.clip!r}")
         if self.view is not None:
             check_count("view", self.view, minimum=1)
+        check_confidence(self.confidence)
 
     @property
     def games(self) -> int:
@@ -161,7 +169,9 @@ def solve(
     device = find_device(options.device)
     named = isinstance(policy, (str, os.PathLike))  # a network that is nobody else's
     policy = _placed(_loaded(policy, device), device)
-    name, policy = network_name(policy), _configured(policy, options, instance.n_nodes)
+    name, own = network_name(policy), policy
+    policy = _configured(own, options, instance.n_nodes)
+    greedy = _configured(own, replace(options, decode="greedy", clip=None), instance.n_nodes)
     generator = torch.Generator(device).manual_seed(options.seed) if options.decode == "sample" else None
 
     start = time.perf_counter()
@@ -169,10 +179,10 @@ def solve(
     state = begin(team, game, begun, options.games, options.augment, device)
     with torch.inference_mode(named):
         with _autocast(policy, options, options.games, instance.n_nodes, device):
-            tours = best_tours(play(policy, state, game, generator))
+            tours = best_tours(play(policy, state, game, generator, _sharpness(policy, own)))
         with _autocast(policy, options, GAMES, instance.n_nodes, device):
             rng = np.random.default_rng(options.seed)
-            tours = reconstruct(team, tours, policy, SPEED, options.reconstruct, rng, begun, device)
+            tours = reconstruct(team, tours, greedy, SPEED, options.reconstruct, rng, begun, device)
     tours = improve(instance, tours + [[0, 0] for _ in range(instance.n_agents - team.n_agents)])
     seconds = time.perf_counter() - start
 
@@ -242,6 +252,7 @@ def _configured(policy: Any, options: SolveOptions, n_nodes: int) -> Any:
     config: Any = getattr(policy, "config", None)
     known = {field.name for field in fields(config)} if is_dataclass(config) else set()
     given = {"tanh_clip": options.clip, "view": options.view, "prune_visited": options.prune_visited}
+    given["confidence"] = options.confidence
     changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     for name in changes.keys() - known:
         option = "clip" if name == "tanh_clip" else name
@@ -256,6 +267,11 @@ def _configured(policy: Any, options: SolveOptions, n_nodes: int) -> Any:
     policy = copy(policy)
     policy.config = replace(config, **changes)
     return policy
+
+
+def _sharpness(policy: Any, own: Any) -> float:
+    """How many times as large the logits of a configured policy are as its own; 1 if nothing depends on it."""
+    return policy.config.tanh_clip / own.config.tanh_clip if hasattr(policy, "forward_next") else 1.0
 
 
 def _autocast(policy: Any, options: SolveOptions, games: int, n_nodes: int, device: torch.device) -> torch.autocast:

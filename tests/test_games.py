@@ -1,5 +1,7 @@
 """Games of one instance, played by the rules: the same in NumPy (CPU) and in torch (GPU), as in the environment."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -7,9 +9,11 @@ import torch
 from benchmarks.policies.nearest import nearest
 from dan_policy import make_actor, rollout
 from dan_policy.games import begin, best_tours, play
+from dan_policy.joint import JointConfig, JointDAN
 from dan_policy.planning import SPEED
 from mtsp_env import check_tours, rules, uniform
 from mtsp_env.batched import BatchedMTSP
+from mtsp_env.instance import batch
 
 GAME = rules.make_rules(15, 3, SPEED, "final", "sparse", None)
 
@@ -65,3 +69,88 @@ def test_samples_follow_the_softmax_over_legal_nodes():
     end = play(logits, begin(instance, game, rows=20_000), game, torch.Generator().manual_seed(0))
     first = (end.visits[:, 1] < end.visits[:, 2]).mean()
     assert first == pytest.approx(1 / (1 + np.exp(-1)), abs=0.01)
+
+
+class Timetable:
+    """Foresees everything: each agent's logits for its next node are the same in every state, whoever decides."""
+
+    in_keys = ("visited", "agent")
+
+    def __init__(self, confidence, n_agents=3, n_nodes=15, sharpness=30.0):
+        generator = torch.Generator().manual_seed(4)
+        self.table = sharpness * torch.rand(n_agents, n_nodes, generator=generator)
+        self.config = SimpleNamespace(confidence=confidence)
+        self.looks = []  # the deciding agents of the games that were looked at, for each forward pass
+
+    def __call__(self, visited, agent):
+        return self.table[agent]
+
+    def forward_next(self, visited, agent):
+        self.looks.append(agent.tolist())
+        return self.table.expand(len(agent), -1, -1).clone()
+
+
+@pytest.mark.parametrize("seed", [None, 0])
+def test_who_foresees_everything_plays_the_same_games_with_fewer_looks(seed):
+    instance = uniform(np.random.default_rng(2), 15, 3)
+    start = begin(instance, GAME, rows=4, augment=True)
+    looks = {}
+    for confidence in (None, 1.0, 0.9, 0.3):
+        policy = Timetable(confidence)
+        end = play(policy, start, GAME, None if seed is None else torch.Generator().manual_seed(seed))
+        looks[confidence] = sum(map(len, policy.looks))
+        if confidence is None:
+            expected = end
+        assert all(np.array_equal(end.arrays()[name], array) for name, array in expected.arrays().items())
+    assert looks[None] == 0 < looks[0.3] < looks[0.9] < looks[1.0]
+
+
+def test_sharper_logits_do_not_make_a_network_surer():
+    """With the logits that samples are drawn from, agents look as often as with those of the training."""
+    start = begin(uniform(np.random.default_rng(2), 15, 3), GAME, rows=4, augment=True)
+    looks = []
+    for times in (1.0, 4.0):
+        policy = Timetable(0.9, sharpness=30.0 * times)
+        play(policy, start, GAME, sharpness=times)
+        looks.append(policy.looks)
+    sharp = Timetable(0.9, sharpness=120.0)
+    play(sharp, start, GAME)
+    assert looks[0] == looks[1] and len(sharp.looks) < len(looks[0])
+
+
+def test_nobody_acts_twice_on_what_was_foreseen_once():
+    """However low the confidence, an agent that has moved since the last look asks for a new one."""
+    instance = uniform(np.random.default_rng(2), 15, 3)
+    policy, state = Timetable(1e-9), begin(instance, GAME)
+    deciders = []
+    end = play(policy, state, GAME)
+    while not rules.terminated(state).all():  # the same game, one decision after the other
+        deciders.append(int(rules.agent_to_decide(state)[0]))
+        state = rules.depart(state, GAME, np.array([_likeliest(policy, state)]))
+    assert best_tours(state) == best_tours(end)
+    expected, moved = [], {0, 1, 2}
+    for agent in deciders:
+        if agent in moved:
+            expected.append([agent])
+            moved = set()
+        moved.add(agent)
+    assert policy.looks == expected
+
+
+def _likeliest(policy, state):
+    mask = torch.as_tensor(rules.observe(state, GAME).action_mask)[0]
+    return int(policy.table[int(rules.agent_to_decide(state)[0])].masked_fill(~mask, -torch.inf).argmax())
+
+
+def test_games_side_by_side_look_when_they_would_alone():
+    torch.manual_seed(3)
+    network = JointDAN(JointConfig(embed_dim=16, feedforward_dim=32, n_heads=2, n_layers=1, confidence=0.2)).eval()
+    instances = [uniform(np.random.default_rng(seed), 15, 3) for seed in range(4)]
+    timetable, looks = Timetable(0.3), []
+    for policy in (network, timetable):
+        alone = [best_tours(play(policy, begin(instance, GAME), GAME)) for instance in instances]
+        looks.append(sorted(agent for agents in timetable.looks for agent in agents))
+        together = play(policy, rules.start(batch(instances), GAME), GAME)
+        assert list(map(rules.tours, together.visits, together.destination)) == alone
+    both = sorted(agent for agents in timetable.looks for agent in agents)
+    assert both == sorted(2 * looks[1]), "as often together as alone"

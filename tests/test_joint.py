@@ -85,6 +85,13 @@ def test_the_deciders_row_of_the_dense_logits_is_the_policy(network):
     assert torch.allclose(network(cities, agents, visited, agent), dense.policy, atol=1e-5)
 
 
+def test_what_all_agents_do_next_is_what_the_dense_logits_say(network):
+    seen = observation(batch=6)
+    assert torch.allclose(network.forward_next(*seen), network.forward_dense(*seen).next, atol=1e-5)
+    shaped = [part.unflatten(0, (2, 3)) for part in seen]
+    assert torch.equal(network.forward_next(*shaped), network.forward_next(*seen).unflatten(0, (2, 3)))
+
+
 def test_a_batch_equals_its_rows_alone(network):
     together = network(*observation())
     for row in range(5):
@@ -231,6 +238,8 @@ def test_the_default_has_about_a_million_parameters():
         ({"tanh_clip": 0.0}, r"tanh_clip must be a number above 0 and at most 1e\+06, got 0.0"),
         ({"view": 0}, "view must be None or at least 1 city, got 0"),
         ({"distances": 1}, "distances must be True or False, got 1"),
+        ({"confidence": 0.0}, "confidence must be None, or above 0 and at most 1, got 0.0"),
+        ({"confidence": True}, "confidence must be None, or above 0 and at most 1, got True"),
         ({"polar": "yes"}, "polar must be True or False, got 'yes'"),
         ({"reads": ("moon",)}, r"reads must be different keys of \['agent_speeds', .*\], got \('moon',\)"),
         ({"reads": ("service", "service")}, r"reads must be different keys"),

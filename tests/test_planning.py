@@ -1,6 +1,7 @@
 """Plans: tours always solve the instance, whatever the options; bad options are named before anything is planned."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from torch import nn
 
 import mtsp_env
 from benchmarks.policies.nearest import nearest
-from dan_policy import DAN, DANConfig, SolveOptions, heuristics, make_actor, planning, solve
+from dan_policy import DAN, DANConfig, JointConfig, JointDAN, SolveOptions, heuristics, make_actor, planning, solve
 from mtsp_env import Instance, check_tours, makespan, uniform
 
 SMALL = DANConfig(embed_dim=16, feedforward_dim=32, n_heads=2, city_layers=1, prune_visited=True)
@@ -231,6 +232,32 @@ def test_large_instances_are_seen_in_part(monkeypatch, n_nodes, view, seen):
     instance = uniform(np.random.default_rng(0), n_nodes, 3)
     solve(instance, network, device="cpu", precision="float32", view=view)
     assert max(longest) == seen and network.config.view is None
+
+
+def test_a_confident_network_looks_less_often_and_its_own_config_says_how_often(monkeypatch):
+    looks = []
+    forward_next, forward = JointDAN.forward_next, JointDAN.forward
+    monkeypatch.setattr(JointDAN, "forward_next", lambda self, *seen: looks.append(1) or forward_next(self, *seen))
+    monkeypatch.setattr(JointDAN, "forward", lambda self, *seen: looks.append(1) or forward(self, *seen))
+    torch.manual_seed(0)
+    network = JointDAN(JointConfig(embed_dim=16, feedforward_dim=16, n_heads=2, n_layers=1))
+    instance = uniform(np.random.default_rng(0), 15, 3)
+
+    def tours_and_looks(policy, **options):
+        looks.clear()
+        return solve(instance, policy, device="cpu", precision="float32", **options).tours, len(looks)
+
+    tours, every_decision = tours_and_looks(network)
+    assert tours_and_looks(network, confidence=1.0) == (tours, every_decision)
+    hasty = tours_and_looks(network, confidence=1e-6)
+    assert hasty[1] < every_decision
+    network.config = replace(network.config, confidence=1e-6)
+    assert tours_and_looks(network) == hasty
+    assert tours_and_looks(network, confidence=1.0) == (tours, every_decision)
+    with pytest.raises(ValueError, match=r"confidence must be None, or above 0 and at most 1, got 1\.5"):
+        solve(instance, network, confidence=1.5)
+    with pytest.raises(ValueError, match="confidence needs a network whose config has the field 'confidence'"):
+        solve(instance, nearest, confidence=0.9)
 
 
 def test_a_view_is_for_networks_that_have_one(network):

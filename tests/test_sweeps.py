@@ -64,6 +64,18 @@ def test_the_table_compares_with_seeing_everything(tmp_path) -> None:
 
 
 @pytest.mark.slow
+def test_the_table_compares_with_agents_that_look_for_themselves(tmp_path) -> None:
+    out = tmp_path / "confidence.md"
+    assert main(["sweep-confidence", "--sizes", "15x3", "--instances", "2", "--out", str(out)]) == 0
+    rows = [line.strip("| ").split(" | ") for line in out.read_text().splitlines() if line.startswith("| 15")]
+    assert [(row[1], row[3] == "–") for row in rows] == [
+        ("1", True), ("0.99", False), ("0.97", False), ("0.95", False), ("0.9", False)
+    ]  # fmt: skip
+    plans = [solve(one, confidence=1.0) for one in Cell(15, 3, 2).instances(sweeps.SEED)]
+    assert float(rows[0][2]) == pytest.approx(np.mean([plan.makespan for plan in plans]), abs=1e-4)
+
+
+@pytest.mark.slow
 def test_the_table_compares_ways_to_search_on_one_thread(tmp_path, monkeypatch) -> None:
     """The symmetries and the rounds never make tours longer, and the number of threads stays as it was."""
     threads, used, out = torch.get_num_threads(), set(), tmp_path / "search.md"

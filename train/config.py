@@ -14,7 +14,7 @@ from dan_policy.registry import NETWORKS
 from mtsp_env.checks import check_count, check_seconds
 from mtsp_env.distributions import Generator, check_distribution, check_scenario
 
-OVERRIDES = ("prune_visited", "reads", "distances", "polar")
+OVERRIDES = ("prune_visited", "reads", "distances", "polar", "confidence")
 """Options of a network that a run may change in the weights of ``init``."""
 
 
@@ -80,6 +80,9 @@ class RunConfig:
     polar: bool | None = None
     """With `init`: override whether the tokens of the joint network know their distance from the decider, and their
     distance and direction from the depot. At first this has no effect."""
+    confidence: float | None = None
+    """With `init`: override how certain what the joint network foresees for other agents must be for `solve` to act on
+    it. It changes no weights."""
     max_grad_norm: float = 1.0
     """Gradients are scaled down to this norm if theirs is larger."""
     average: float = 0.0

@@ -1,8 +1,10 @@
-"""Sweeps over options of ``solve``: C, the range of the logits of samples, the cities in view, and ways to search."""
+"""Sweeps over options of ``solve``: C, the range of the logits of samples, the cities in view, how certain foreseen
+decisions must be, and ways to search."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +24,7 @@ RESULTS = Path(__file__).parents[1] / "results"
 SEED = 123  # not that of a test set or of training
 C_FACTORS = (1.0, 0.5, 2.0)  # in units of the C that ``solve`` uses
 VIEWS = (200, 100, 50)  # cities
+CONFIDENCES = (1.0, 0.99, 0.97, 0.95, 0.9)
 
 
 def sweep_clip(
@@ -90,6 +93,34 @@ def sweep_view(
     _sweep(out, title, note, "cities in view", cells, choices, policy)
 
 
+def sweep_confidence(
+    sizes: tuple[str, ...] = ("50x5", "100x5", "100x10", "200x10"),
+    instances: int = 32,
+    policy: str = "default",
+    out: Path = RESULTS / "confidence.md",
+) -> None:
+    """Compare greedy games in which agents look for themselves with those in which they use what was foreseen.
+
+    Args:
+        sizes: sizes of the instances, such as 50x5.
+        instances: number of instances of each size, at least 2.
+        policy: a shipped model or a file of weights.
+        out: file for the table.
+
+    Raises:
+        ValueError: fewer than 2 instances, or a bad size.
+    """
+    cells = _cells(sizes, instances)
+    note = (
+        f"In the first line of a size, every agent looks for itself. Seconds on one thread, median over the instances. "
+        f'Weights "{policy}", {describe_machine()["processor"]}. '
+        f"Made by `python -m benchmarks sweep-confidence --sizes {' '.join(sizes)} --instances {instances}`."
+    )
+    choices = {f"{confidence:g}": SolveOptions(confidence=confidence) for confidence in CONFIDENCES}
+    with _one_thread():
+        _sweep(out, "# Confidence: greedy", note, "confidence", cells, [choices] * len(cells), policy)
+
+
 def sweep_search(
     sizes: tuple[str, ...] = ("50x5", "50x10", "100x5", "100x10", "200x10"),
     instances: int = 12,
@@ -121,10 +152,17 @@ def sweep_search(
     ways = {"greedy": SolveOptions(), "greedy x8": symmetric}
     ways |= {f"best of {k} samples": replace(symmetric, decode="sample", samples=k) for k in samples}
     ways |= {f"greedy x8, {k} rounds": replace(symmetric, reconstruct=k) for k in rounds}
+    with _one_thread():
+        _sweep(out, "# Search with a policy", note, "way", cells, [ways] * len(cells), policy)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """PyTorch with one thread."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        _sweep(out, "# Search with a policy", note, "way", cells, [ways] * len(cells), policy)
+        yield
     finally:
         torch.set_num_threads(threads)
 
