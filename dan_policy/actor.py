@@ -1,33 +1,18 @@
-"""Any network, from an observation to logits, as a TorchRL policy. This module knows no environment.
-
-A *network* is a module or a plain function that takes the tensors of its ``in_keys`` in order and returns logits
-(..., n). Attributes that it may have:
-
-- ``in_keys``: the keys of the observation that it reads, by default ``OBSERVATION``; a nested key is a tuple. It gets
-  None for a key that the observation does not have, such as ``agent_speeds`` in a plain game;
-- ``config``: a dataclass. ``dan_policy.solve`` can change its fields ``tanh_clip``, ``view`` and ``prune_visited``, if
-  it has them, for one call, so the network should read them in each forward pass;
-- ``supports_bfloat16``: True if its matrix products may run in bfloat16 under ``torch.autocast``.
-"""
+"""Any network, from an observation to logits, as a TorchRL policy. This module knows no environment."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import MaskedCategorical, ProbabilisticActor
 
-Network = Callable[..., Tensor]
-"""A module or a plain function: the tensors of its ``in_keys`` -> logits (..., n)."""
-
-Key = str | tuple[str, ...]
-"""A key of a TensorDict; a tuple leads into nested ones."""
-
-OBSERVATION: tuple[Key, ...] = ("cities", "agents", "visited")
+from dan_policy.network import Key, Network, check_greatest, network_keys
 
 
 class FiniteCategorical(MaskedCategorical):
@@ -41,15 +26,6 @@ class FiniteCategorical(MaskedCategorical):
         if not torch.compiler.is_compiling():
             check_greatest(logits.detach().masked_fill(~mask, -torch.inf).amax(-1))
         super().__init__(logits, mask=mask, **options)
-
-
-def check_greatest(logits: Tensor) -> None:
-    """Raise ValueError if a greatest legal logit (B,) is NaN, as it is if any of them is, or infinity."""
-    if not (logits < torch.inf).all():
-        raise ValueError(
-            f"the policy's logits must be finite, got {float(logits.max())}: parameters of the network may be NaN, "
-            "infinite or far too large, or its input is"
-        )
 
 
 def make_actor(
@@ -86,6 +62,29 @@ def as_actor(policy: Network | TensorDictModuleBase) -> TensorDictModuleBase:
     return policy if isinstance(policy, TensorDictModuleBase) else make_actor(policy)
 
 
-def network_keys(network: Network) -> tuple[Key, ...]:
-    """The keys of the observation that ``network`` takes: its attribute ``in_keys``, or ``OBSERVATION``."""
-    return tuple(getattr(network, "in_keys", OBSERVATION))
+def logits_of_actor(
+    actor: TensorDictModuleBase, observation: Mapping[str, Tensor], game: Mapping[str, Tensor]
+) -> Tensor:
+    """Logits (B, n) of an actor's choice, without TorchRL's exploration type, which belongs to the whole process.
+
+    Args:
+        actor: if it has no distribution, its logits leave no choice but the ``action`` that it writes.
+        observation: tensors of the observation, B rows each.
+        game: those of the state, which the actor finds under "game".
+
+    Raises:
+        ValueError: an illegal action.
+    """
+    size = [observation["visited"].shape[0]]
+    td = TensorDict({**observation, "game": TensorDict(dict(game), size)}, size)
+    if isinstance(actor, ProbabilisticTensorDictSequential):  # without `get_dist`, which sets the exploration type
+        return actor.build_dist_from_params(actor.det_part(td)).logits
+    return _logits_of_choice(actor(td))
+
+
+def _logits_of_choice(decided: TensorDictBase) -> Tensor:
+    """Logits that leave no choice but the ``action`` (B,) that an actor without a distribution has written."""
+    action, mask = decided["action"], decided["action_mask"]
+    if not mask.gather(1, action[:, None]).all():
+        raise ValueError(f"the policy chose an illegal action, got {action.tolist()}")
+    return torch.full(mask.shape, -torch.inf, device=mask.device).scatter(1, action[:, None], 0.0)

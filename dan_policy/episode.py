@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -13,11 +12,11 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from dan_policy.actor import Key, Network, as_actor
+from dan_policy.actor import as_actor
+from dan_policy.network import Decode, Key, Network
 from mtsp_env.checks import check_count
 from mtsp_env.instance import Problem
 
-Decode = Literal["greedy", "sample"]
 EXPLORATION = {"greedy": ExplorationType.DETERMINISTIC, "sample": ExplorationType.RANDOM}
 
 
@@ -94,19 +93,3 @@ def _as_tensordict(instances: Tensor | Problem | TensorDictBase, env: EnvBase) -
     tensors = {name: torch.as_tensor(array, device=env.device) for name, array in arrays.items()}
     size = {"batch_size": tensors["nodes"].shape[:1], "device": env.device}
     return TensorDict({"game": TensorDict(tensors, **size)}, **size)
-
-
-def find_device(device: torch.device | str | None = None) -> torch.device:
-    """The device with this name; None takes a GPU if there is one.
-
-    Raises:
-        ValueError: an unknown name, or a device that this machine does not have.
-    """
-    try:
-        chosen = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-        if chosen.type == "meta" or (chosen.type == "cpu" and chosen.index):  # PyTorch takes any number for the CPU
-            raise RuntimeError("meta tensors hold no numbers, and there is one device for all CPUs")
-        return torch.empty(0, device=chosen).device  # with its index: "cuda" is "cuda:0" by default
-    except (RuntimeError, AssertionError, NotImplementedError, ImportError) as error:
-        reason = str(error).splitlines()[0]
-        raise ValueError(f"no device {str(device)!r} here; choose for example 'cpu' or 'cuda' ({reason})") from error

@@ -7,21 +7,22 @@ each other. On a CPU the rules run in NumPy, which is faster than torch for arra
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 
-from dan_policy.actor import Key, Network, check_greatest, network_keys
 from dan_policy.layers import padded_length
+from dan_policy.network import Key, Network, check_greatest, is_actor, network_keys
 from dan_policy.symmetry import views
 from mtsp_env import rules
 from mtsp_env.arrays import library, locate, pick
 from mtsp_env.instance import Array, Instance, Problem, Tours, batch
+
+if TYPE_CHECKING:
+    from tensordict.nn import TensorDictModuleBase
 
 Logits = Callable[[rules.State, rules.Observation], Tensor]
 """What the deciding agents see, and the state of their games -> logits (B, n)."""
@@ -162,10 +163,10 @@ def next_on_tour(first: Array, following: Array, agent: Array, destination: Arra
 
 
 def _logits_of(policy: Network | TensorDictModuleBase) -> Logits:
-    if isinstance(policy, ProbabilisticTensorDictSequential):  # without `get_dist`, which sets the exploration type
-        return lambda state, seen: policy.build_dist_from_params(policy.det_part(_tensordict(state, seen))).logits
-    if isinstance(policy, TensorDictModuleBase):
-        return lambda state, seen: _logits_of_choice(policy(_tensordict(state, seen)))
+    if is_actor(policy):
+        from dan_policy.actor import logits_of_actor  # imports TorchRL
+
+        return lambda state, seen: logits_of_actor(policy, _tensors(seen.arrays()), _tensors(state.arrays()))
     keys = network_keys(policy)
     return lambda state, seen: policy(*(_tensor(state, seen, key) for key in keys))
 
@@ -205,14 +206,6 @@ def _foreseen_logits(network: Any, confidence: float, sharpness: float) -> Logit
     return logits_of
 
 
-def _logits_of_choice(decided: TensorDictBase) -> Tensor:
-    """Logits that leave no choice but the ``action`` (B,) that an actor without a distribution has written."""
-    action, mask = decided["action"], decided["action_mask"]
-    if not mask.gather(1, action[:, None]).all():
-        raise ValueError(f"the policy chose an illegal action, got {action.tolist()}")
-    return torch.full(mask.shape, -torch.inf, device=mask.device).scatter(1, action[:, None], 0.0)
-
-
 def _tensor(state: rules.State, seen: rules.Observation, key: Key) -> Tensor | None:
     """What a network reads under ``key``: a part of the observation, or of the state under "game".
 
@@ -228,8 +221,5 @@ def _tensor(state: rules.State, seen: rules.Observation, key: Key) -> Tensor | N
     raise ValueError(f"the network reads {key!r}; choose from {choices}")
 
 
-def _tensordict(state: rules.State, seen: rules.Observation) -> TensorDict:
-    observation = {name: torch.as_tensor(array) for name, array in seen.arrays().items()}
-    game = {name: torch.as_tensor(array) for name, array in state.arrays().items()}
-    size = [observation["visited"].shape[0]]
-    return TensorDict({**observation, "game": TensorDict(game, size)}, size)
+def _tensors(arrays: Mapping[str, Array]) -> dict[str, Tensor]:
+    return {name: torch.as_tensor(array) for name, array in arrays.items()}

@@ -108,7 +108,9 @@ class JointDAN(nn.Module):
         self.embed_agent = nn.Linear(3, d)
         if config.polar:
             self.embed_polar = nn.Linear(4, d, bias=False)
-        self.decider = nn.Parameter(torch.randn(d) / 2)  # added to the deciding agent's token
+        self.decider = nn.Parameter(torch.empty(d))  # added to the deciding agent's token
+        if not self.decider.is_meta:  # ``load`` builds it without memory first: drawing then takes seconds of imports
+            nn.init.normal_(self.decider, std=0.5)
         self.layers = nn.ModuleList(
             AttentionLayer(d, config.feedforward_dim, config.n_heads, "pre") for _ in range(config.n_layers)
         )
@@ -118,8 +120,8 @@ class JointDAN(nn.Module):
         self.assignment_query = nn.Linear(d, d, bias=False)
         self.assignment_key = nn.Linear(d, d, bias=False)
         if config.distances:  # from one head that sees everything alike to one that sees little but its neighbours
-            slopes = -3.0 * torch.linspace(0.0, 1.0, config.n_heads).square()
-            self.distance_slopes = nn.Parameter(slopes.repeat(config.n_layers, 1))  # (layers, heads)
+            slopes = [-3.0 * (head / max(config.n_heads - 1, 1)) ** 2 for head in range(config.n_heads)]
+            self.distance_slopes = nn.Parameter(torch.tensor([slopes] * config.n_layers))  # (layers, heads)
             self.next_slope = nn.Parameter(torch.tensor(-0.1))
             self.assignment_slope = nn.Parameter(torch.tensor(-0.5))
         self.effect = nn.ParameterDict({key: torch.zeros(d) for key in config.reads})  # of each key, see the module

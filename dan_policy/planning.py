@@ -10,18 +10,16 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from threading import Lock
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 import torch
-from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from dan_policy.actor import Network
-from dan_policy.episode import Decode, find_device
 from dan_policy.games import begin, best_tours, play
 from dan_policy.heuristics import bfloat16_pays, default_view, sampling_clip
 from dan_policy.layers import check_confidence
+from dan_policy.network import Decode, Network, find_device, is_actor
 from dan_policy.reconstruct import GAMES, reconstruct
 from dan_policy.registry import find, load, network_name
 from dan_policy.symmetry import SYMMETRIES
@@ -30,6 +28,9 @@ from mtsp_env.checks import check_count, check_seconds
 from mtsp_env.instance import Instance, Tours, check_plannable
 from mtsp_env.machine import check_memory
 from mtsp_env.tours import check_prefixes, check_tours, makespan
+
+if TYPE_CHECKING:
+    from tensordict.nn import TensorDictModuleBase
 
 Precision = Literal["auto", "float32", "bfloat16"]
 BYTES_PER_AGENT = 200  # of its tour as a list
@@ -238,13 +239,11 @@ def _placed(policy: Any, device: torch.device) -> Any:
     if not isinstance(policy, nn.Module):
         return policy
     tensors = [*policy.parameters(), *policy.buffers()]
-    networks = (module for module in policy.modules() if not isinstance(module, _WRAPPERS))
+    wrappers = (module for module in policy.modules() if is_actor(module) or isinstance(module, nn.ModuleList))
+    networks = set(policy.modules()) - set(wrappers)  # the mode of what is around an actor's network changes nothing
     if any(tensor.device != device for tensor in tensors) or any(module.training for module in networks):
         return deepcopy(policy).to(device).eval()
     return policy
-
-
-_WRAPPERS = (TensorDictModuleBase, nn.ModuleList)  # around an actor's network: their own mode changes nothing
 
 
 def _configured(policy: Any, options: SolveOptions, n_nodes: int) -> Any:

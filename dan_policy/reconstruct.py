@@ -12,18 +12,20 @@ Random re-construction was proposed for a single tour by LEHD (Luo et al. 2023).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from tensordict.nn import TensorDictModuleBase
 
-from dan_policy.actor import Network
 from dan_policy.games import as_links, begin, best_tours, next_on_tour, play
+from dan_policy.network import Network
 from mtsp_env import rules
 from mtsp_env.arrays import library
 from mtsp_env.instance import FIELDS, Instance, Tours
 from mtsp_env.tours import is_closed, tour_times
+
+if TYPE_CHECKING:
+    from tensordict.nn import TensorDictModuleBase
 
 GAMES = 16  # side by side in each round: two in each symmetry of the square
 SMALL_TEAM = 3  # a team has at most so many agents, unless all of them plan again,

@@ -23,10 +23,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as serialise
 from torch import Tensor, nn
 
-from dan_policy.actor import Network, network_keys
 from dan_policy.dan import DAN, DANConfig
-from dan_policy.episode import find_device
 from dan_policy.joint import JointConfig, JointDAN
+from dan_policy.network import Network, find_device, network_keys
 from mtsp_env.writing import atomic_write
 
 FORMAT = "dan-policy-2"

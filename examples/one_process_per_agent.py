@@ -138,7 +138,7 @@ def make_policy(name: str) -> Policy:
     import torch
 
     from dan_policy import load
-    from dan_policy.actor import network_keys
+    from dan_policy.network import network_keys
 
     torch.set_num_threads(1)
     network = load(name)

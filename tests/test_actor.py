@@ -8,7 +8,8 @@ from torchrl.collectors import Collector
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from dan_policy import DAN, DANConfig, make_actor, rollout
-from dan_policy.actor import FiniteCategorical, as_actor, network_keys
+from dan_policy.actor import FiniteCategorical, as_actor
+from dan_policy.network import network_keys
 from mtsp_env.batched import BatchedMTSP
 
 SMALL = DANConfig(embed_dim=16, feedforward_dim=32, n_heads=2, city_layers=1, prune_visited=True)

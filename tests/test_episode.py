@@ -7,7 +7,7 @@ from tensordict import TensorDict
 
 from benchmarks.policies.nearest import nearest
 from dan_policy import DAN, DANConfig, make_actor, rollout
-from dan_policy.episode import find_device
+from dan_policy.network import find_device
 from mtsp_env import check_tours, mtsp_v0, uniform
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.instance import batch

@@ -38,6 +38,7 @@ FORBIDDEN = {
     "dan_policy/dan.py": ["mtsp_env*"],
     "dan_policy/joint.py": ["mtsp_env*"],
     "dan_policy/layers.py": ["mtsp_env*"],
+    "dan_policy/network.py": ["mtsp_env*", "tensordict*", "torchrl*"],
     "dan_policy/actor.py": ["mtsp_env*"],
     "benchmarks/peers/rl4co_speed.py": ["mtsp_env*", "dan_policy*", "train*", "benchmarks*"],
 }
@@ -173,6 +174,23 @@ import mtsp_env, mtsp_env.mtsp_v0
 assert numpy.random.get_state()[1].tobytes() == before, "numpy's global random state has changed"
 heavy = sorted({NEEDS_AN_EXTRA!r} & set(sys.modules))
 assert not heavy, heavy
+"""
+    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+
+
+@pytest.mark.slow
+def test_planning_does_not_wait_for_torchrl() -> None:
+    """TorchRL, TensorDict and torch's compiler together take twice as long to import as torch itself."""
+    code = """
+import sys
+from dan_policy import solve
+from mtsp_env import Instance
+instance = Instance([[0.5, 0.5], [0.1, 0.2], [0.9, 0.3], [0.7, 0.8]], 2)
+for policy in ("default", "dan"):
+    solve(instance, policy, device="cpu", decode="sample", samples=2, augment=True, reconstruct=1)
+late = sorted({"tensordict", "torchrl", "torch._dynamo"} & set(sys.modules))
+assert not late, late
 """
     run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr

@@ -18,7 +18,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from dan_policy.actor import Key
+from dan_policy.network import Key
 from dan_policy.registry import find
 from mtsp_env.machine import check_memory
 from mtsp_env.processes import end_with_parent

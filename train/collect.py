@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from dan_policy.actor import Key, as_actor
-from dan_policy.episode import Decode, Episode, rollout
+from dan_policy.actor import as_actor
+from dan_policy.episode import Episode, rollout
+from dan_policy.network import Decode, Key
 from dan_policy.symmetry import views
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.distributions import sample

@@ -19,9 +19,9 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-from dan_policy.actor import Key
 from dan_policy.episode import rollout
 from dan_policy.games import as_links, next_on_tour
+from dan_policy.network import Key
 from mtsp_env import rules
 from mtsp_env.distributions import sample
 from mtsp_env.instance import Problem, Tours

@@ -14,7 +14,7 @@ import torch
 from torch import nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from dan_policy.episode import find_device
+from dan_policy.network import find_device
 from train import checkpoint
 from train.collect import costs, draw_set
 from train.config import RunConfig

@@ -12,7 +12,8 @@ import torch
 from torch import nn
 from torchrl.modules import ProbabilisticActor
 
-from dan_policy.actor import Key, make_actor
+from dan_policy.actor import make_actor
+from dan_policy.network import Key
 from dan_policy.registry import NETWORKS, build, load, save
 from mtsp_env.batched import BatchedMTSP
 from train.config import OVERRIDES, RunConfig

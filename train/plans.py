@@ -13,8 +13,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn import functional
 
-from dan_policy.actor import Key
 from dan_policy.layers import DenseLogits
+from dan_policy.network import Key
 from train.demonstrations import Demonstrations
 
 PLAN_KEYS: tuple[Key, ...] = ("visited", "agent", ("game", "destination"))

@@ -13,8 +13,9 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.collectors import Collector
 
-from dan_policy.actor import Key, make_actor
+from dan_policy.actor import make_actor
 from dan_policy.episode import Episode, rollout
+from dan_policy.network import Key
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.instance import Problem
 from train.collect import draw, draw_size, environment, play, present, repeat

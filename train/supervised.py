@@ -10,8 +10,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from dan_policy.actor import network_keys
 from dan_policy.layers import DenseLogits
+from dan_policy.network import network_keys
 from train.collect import autocast
 from train.learner import Learner
 from train.optimisers import make_optimiser

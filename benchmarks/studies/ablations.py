@@ -26,8 +26,9 @@ from benchmarks.reports.markdown import markdown_table
 from benchmarks.studies.variants import NOTES, STUDIES, Budget, Stage, Study, Variant
 from benchmarks.suite import SEED, Cell
 from dan_policy import DANConfig
-from dan_policy.episode import Decode, rollout
+from dan_policy.episode import rollout
 from dan_policy.joint import JointConfig
+from dan_policy.network import Decode
 from dan_policy.planning import SPEED
 from dan_policy.registry import load
 from mtsp_env.batched import BatchedMTSP

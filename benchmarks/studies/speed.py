@@ -15,7 +15,7 @@ from benchmarks.studies import speed_peers, speed_solve, speed_train
 from benchmarks.studies.speed_train import Precision
 from benchmarks.studies.timing import machine_title, matmul_rate, per_second, wait_for
 from dan_policy import DAN, DANConfig, load, rollout
-from dan_policy.episode import find_device
+from dan_policy.network import find_device
 from mtsp_env import mtsp_v0
 from mtsp_env.batched import BatchedMTSP
 from mtsp_env.checks import check_count, check_seconds

@@ -14,7 +14,7 @@ from rich.table import Table
 from benchmarks.studies.timing import machine_title
 from benchmarks.suite import SEED, Cell
 from dan_policy import solve
-from dan_policy.episode import Decode
+from dan_policy.network import Decode
 from mtsp_env.processes import end_with_parent
 
 
