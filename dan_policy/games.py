@@ -177,11 +177,17 @@ def _foreseen_logits(network: Any, confidence: float, sharpness: float) -> Logit
     ``network.forward_next`` says where each agent goes next, not only the decider. Agents that decide after it do what
     was foreseen for them if its probability is above ``confidence``; if not, or if they have already done so, the
     network looks again, with the eyes of the agent that decides now. Games that are over need no further look. However
-    sharp the logits are, certain is what the network was certain of in training.
+    sharp the logits are, certain is what the network was certain of in training. Nothing is foreseen for others while
+    some cities are out of the decider's view, since they may be those that are next to another agent.
     """
-    keys = network_keys(network)
+    keys, view = network_keys(network), getattr(network.config, "view", None)
     foreseen: Tensor | None = None  # (B, m, n) logits of each game's last look
-    unused: Tensor | None = None  # (B, m) False once an agent has moved since then
+    unused: Tensor | None = None  # (B, m) False if nothing was foreseen, or once an agent has moved since then
+
+    def whole(seen: rules.Observation) -> Tensor:
+        """(B,) whether the decider sees all cities that are left."""
+        left = (~torch.as_tensor(seen.visited)).sum(1) - 1  # without the depot
+        return left <= (seen.visited.shape[1] if view is None else view)
 
     def logits_of(state: rules.State, seen: rules.Observation) -> Tensor:
         nonlocal foreseen, unused
@@ -190,7 +196,7 @@ def _foreseen_logits(network: Any, confidence: float, sharpness: float) -> Logit
         row = torch.arange(len(agent), device=agent.device)
         if foreseen is None or unused is None:
             foreseen = network.forward_next(*inputs)
-            unused = torch.ones(foreseen.shape[:2], dtype=torch.bool, device=foreseen.device)
+            unused = whole(seen)[:, None].repeat(1, foreseen.shape[1])
         else:
             legal = foreseen[row, agent].masked_fill(~mask, -torch.inf)
             sure = (legal / sharpness).softmax(1).amax(1) * unused[row, agent]
@@ -199,7 +205,7 @@ def _foreseen_logits(network: Any, confidence: float, sharpness: float) -> Logit
                 asked = sure.argsort()[: min(padded_length(len(asked)), len(row))]
             if len(asked):
                 foreseen[asked] = network.forward_next(*(None if x is None else x[asked] for x in inputs))
-                unused[asked] = True
+                unused[asked] = whole(seen)[asked, None]
         unused[row, agent] = False
         return foreseen[row, agent]
 

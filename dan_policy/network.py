@@ -9,7 +9,8 @@ A *network* is a module or a plain function that takes the tensors of its ``in_k
   ``confidence``, if it has them, for one call, so the network should read them in each forward pass;
 - ``supports_bfloat16``: True if its matrix products may run in bfloat16 under ``torch.autocast``;
 - ``forward_next``: with the arguments of ``forward``, logits (..., m, n) of where each agent goes next. The deciding
-  agent's row is what ``forward`` returns. With ``config.confidence``, ``solve`` then makes fewer forward passes.
+  agent's row is what ``forward`` returns. With ``config.confidence``, ``solve`` then makes fewer forward passes as
+  long as no cities are out of the decider's ``config.view``.
 
 An *actor* is a TensorDict module that reads an observation and writes ``action`` (``dan_policy.actor``). It takes twice
 as long to import TorchRL as to import torch, and ``solve`` needs it only for actors; so nothing here imports it.

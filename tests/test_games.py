@@ -76,10 +76,10 @@ class Timetable:
 
     in_keys = ("visited", "agent")
 
-    def __init__(self, confidence, n_agents=3, n_nodes=15, sharpness=30.0):
+    def __init__(self, confidence, n_agents=3, n_nodes=15, sharpness=30.0, view=None):
         generator = torch.Generator().manual_seed(4)
         self.table = sharpness * torch.rand(n_agents, n_nodes, generator=generator)
-        self.config = SimpleNamespace(confidence=confidence)
+        self.config = SimpleNamespace(confidence=confidence, view=view)
         self.looks = []  # the deciding agents of the games that were looked at, for each forward pass
 
     def __call__(self, visited, agent):
@@ -116,6 +116,19 @@ def test_sharper_logits_do_not_make_a_network_surer():
     sharp = Timetable(0.9, sharpness=120.0)
     play(sharp, start, GAME)
     assert looks[0] == looks[1] and len(sharp.looks) < len(looks[0])
+
+
+@pytest.mark.parametrize("view", [0, 1, 6, 13, 14, None])
+def test_nothing_is_foreseen_for_others_while_cities_are_out_of_view(view):
+    start = begin(uniform(np.random.default_rng(2), 15, 3), GAME)
+    policy, state, decisions = Timetable(1e-9, view=view), start, 0
+    play(policy, start, GAME)
+    while view is not None and (~state.visited[0]).sum() - 1 > view:  # until nothing is out of view
+        state = rules.depart(state, GAME, np.array([_likeliest(policy, state)]))
+        decisions += 1
+    everything = Timetable(1e-9)
+    play(everything, state, GAME)
+    assert len(policy.looks) == decisions + len(everything.looks)
 
 
 def test_nobody_acts_twice_on_what_was_foreseen_once():
