@@ -195,6 +195,8 @@ def _foreseen_logits(network: Any, confidence: float, sharpness: float) -> Logit
         inputs = [_tensor(state, seen, key) for key in keys]
         row = torch.arange(len(agent), device=agent.device)
         if foreseen is None or unused is None:
+            if not whole(seen).any():
+                return network(*inputs)
             foreseen = network.forward_next(*inputs)
             unused = whole(seen)[:, None].repeat(1, foreseen.shape[1])
         else:

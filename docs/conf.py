@@ -57,6 +57,7 @@ PAGES_OF_FILES = {
     "../benchmarks/results/report.md": "measured/report.md",
     "../benchmarks/results/ablations.md": "measured/ablations.md",
     "../benchmarks/results/clip.md": "measured/clip.md",
+    "../benchmarks/results/confidence.md": "measured/confidence.md",
     "../benchmarks/results/exact.md": "measured/exact.md",
     "../benchmarks/results/reference-gaps.md": "measured/reference-gaps.md",
     "../benchmarks/results/search.md": "measured/search.md",
