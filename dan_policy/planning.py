@@ -250,8 +250,9 @@ def _configured(policy: Any, options: SolveOptions, n_nodes: int) -> Any:
     """The policy, or a shallow copy of it that shares its parameters and has the configuration of ``options``."""
     config: Any = getattr(policy, "config", None)
     known = {field.name for field in fields(config)} if is_dataclass(config) else set()
-    given = {"tanh_clip": options.clip, "view": options.view, "prune_visited": options.prune_visited}
-    given["confidence"] = options.confidence
+    given = {name: getattr(options, name) for name in ("view", "prune_visited", "confidence")} | {
+        "tanh_clip": options.clip
+    }
     changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     for name in changes.keys() - known:
         option = "clip" if name == "tanh_clip" else name
@@ -269,8 +270,9 @@ def _configured(policy: Any, options: SolveOptions, n_nodes: int) -> Any:
 
 
 def _sharpness(policy: Any, own: Any) -> float:
-    """How many times as large the logits of a configured policy are as its own; 1 if nothing depends on it."""
-    return policy.config.tanh_clip / own.config.tanh_clip if hasattr(policy, "forward_next") else 1.0
+    """How many times as large the logits of a configured policy are as its own."""
+    clip, own_clip = (getattr(getattr(network, "config", None), "tanh_clip", 1.0) for network in (policy, own))
+    return 1.0 if clip == own_clip else clip / own_clip
 
 
 def _autocast(policy: Any, options: SolveOptions, games: int, n_nodes: int, device: torch.device) -> torch.autocast:

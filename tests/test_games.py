@@ -72,7 +72,7 @@ def test_samples_follow_the_softmax_over_legal_nodes():
 
 
 class Timetable:
-    """Foresees everything: each agent's logits for its next node are the same in every state, whoever decides."""
+    """A network whose logits for an agent's next node depend on that agent alone, so that it foresees all decisions."""
 
     in_keys = ("visited", "agent")
 
@@ -130,6 +130,16 @@ def test_nothing_is_foreseen_for_others_while_cities_are_out_of_view(view):
     everything = Timetable(1e-9)
     play(everything, state, GAME)
     assert len(policy.looks) == decisions + len(everything.looks)
+
+
+def test_under_autocast_few_numbers_of_games_are_looked_at():
+    instances = [uniform(np.random.default_rng(seed), 15, 3) for seed in range(24)]
+    start, policy, plain = rules.start(batch(instances), GAME), Timetable(0.5), Timetable(0.5)
+    with torch.autocast("cpu", torch.bfloat16):
+        end = play(policy, start, GAME)
+    assert best_tours(end) == best_tours(play(plain, start, GAME))
+    assert {len(agents) for agents in policy.looks} <= {8, 16, 24}
+    assert not {len(agents) for agents in plain.looks} <= {8, 16, 24}
 
 
 def test_nobody_acts_twice_on_what_was_foreseen_once():

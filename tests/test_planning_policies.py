@@ -209,3 +209,18 @@ def test_eight_threads_plan_what_one_does_and_change_nothing(network):
         solutions = threads.map(lambda call: solve(call[0], call[1], **call[2]), calls)
         assert [solution.tours for solution in solutions] == serial
     assert process_state() == before
+
+
+def test_a_network_that_foresees_needs_no_configuration():
+    class Foreseeing(nn.Module):
+        in_keys = ("visited", "agents")
+
+        def forward(self, visited, agents):
+            return self.forward_next(visited, agents)[:, 0]
+
+        def forward_next(self, visited, agents):
+            return torch.zeros(len(visited), agents.shape[1], visited.shape[1])
+
+    instance = uniform(np.random.default_rng(0), 9, 2)
+    for decode in ("greedy", "sample"):
+        check_tours(instance, solve(instance, Foreseeing(), decode=decode, samples=2, device="cpu").tours)
