@@ -200,7 +200,15 @@ def test_the_command_takes_better_tours_and_verifies(tmp_path, monkeypatch, caps
     "name",
     [
         *("random", "nearest", "dan-greedy", "dan-greedy-x8", "dan-s64-x8", "dan-improve", "reference"),
-        *("joint-greedy", "joint-greedy-x8", "joint-s64", "joint-r16", "schedulenet-greedy", "schedulenet-s64"),
+        *(
+            "joint-greedy",
+            "joint-greedy-x8",
+            "joint-s64",
+            "joint-s64-x8",
+            "joint-r16",
+            "schedulenet-greedy",
+            "schedulenet-s64",
+        ),
     ],
 )
 @pytest.mark.slow
@@ -237,10 +245,11 @@ def test_solvers_are_loaded_by_name(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     assert solvers.find("misbehaving:deals") is deals
     assert solvers.look_up("joint-s64").options == {"samples": 64}
+    assert solvers.look_up("joint-s64-x8").options == {"samples": 64, "augment": True}
     dan = ["dan-greedy", "dan-greedy-x8", "dan-s64", "dan-s64-x8", "dan-s256", "dan-improve"]
     assert solvers.expand(["nearest, dan", "dan-s64"]) == ["nearest", *dan]
     assert solvers.expand(["all"]) == list(solvers.SOLVERS)
-    assert solvers.expand(["joint"]) == ["joint-greedy", "joint-greedy-x8", "joint-s64", "joint-r16"]
+    assert solvers.expand(["joint"]) == ["joint-greedy", "joint-greedy-x8", "joint-s64", "joint-s64-x8", "joint-r16"]
     with pytest.raises(ValueError, match="unknown solver 'magic'; choose from"):
         solvers.find("magic")
     with pytest.raises(ValueError, match="no solver at 'misbehaving:magic'"):

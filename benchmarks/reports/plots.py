@@ -29,6 +29,7 @@ STYLE = {
     "joint-greedy": ("#e6007e", "H"),
     "joint-greedy-x8": ("#e6007e", "D"),
     "joint-s64": ("#99004d", "H"),
+    "joint-s64-x8": ("#99004d", "D"),
     "joint-r16": ("#4d0026", "H"),
     "dan-improve": ("#8c1c13", "P"),
     "schedulenet-greedy": ("#8c6d31", "o"),

@@ -144,6 +144,7 @@ SOLVERS: dict[str, Solver] = {
     "joint-greedy": _policy("shipped", weights="default"),
     "joint-greedy-x8": _policy("shipped", weights="default", augment=True),
     "joint-s64": _policy("shipped", weights="default", samples=64),
+    "joint-s64-x8": _policy("shipped", weights="default", samples=64, augment=True),
     "joint-r16": _policy("shipped", weights="default", augment=True, reconstruct=16),
     "dan-improve": _policy("improved", "numba", anytime=True, polishes=True, weights="dan", policy="dan"),
     "schedulenet-greedy": _policy("schedulenet", weights="schedulenet"),
@@ -167,7 +168,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "dan": ("dan-greedy", "dan-greedy-x8", "dan-s64", "dan-s64-x8", "dan-s256", "dan-improve"),
     "schedulenet": ("schedulenet-greedy", "schedulenet-greedy-x8", "schedulenet-s64"),
     "hu": ("hu-greedy", "hu-s64"),
-    "joint": ("joint-greedy", "joint-greedy-x8", "joint-s64", "joint-r16"),
+    "joint": ("joint-greedy", "joint-greedy-x8", "joint-s64", "joint-s64-x8", "joint-r16"),
     "all": tuple(SOLVERS),
 }
 
