@@ -1,6 +1,7 @@
 """Self-improvement learns from the best of the policy's own games, lowers costs and resumes bit for bit."""
 
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -9,15 +10,16 @@ from helpers.states import same
 from tiny import TINY_PLANS, interrupt_after
 
 from dan_policy.episode import rollout
+from dan_policy.games import play
 from dan_policy.joint import JointConfig, JointDAN
 from dan_policy.symmetry import views
-from mtsp_env import check_tours, makespan
+from mtsp_env import check_tours, makespan, rules
 from mtsp_env.distributions import sample
-from mtsp_env.instance import Instance
+from mtsp_env.instance import Instance, Problem
 from train import checkpoint
 from train.__main__ import main
 from train.baseline import better
-from train.collect import costs, draw, draw_set, environment, play, repeat, rotated
+from train.collect import costs, draw, draw_set, environment, repeat, rotated
 from train.demonstrations import demonstrate, follow
 from train.improve import ImproveLearner, best_games, improve
 from train.supervised_config import ImproveConfig
@@ -54,12 +56,11 @@ def test_games_that_do_not_fit_into_the_memory_are_refused():
 
 def test_the_best_games_are_those_that_the_judge_finds_best(network):
     problem = draw(np.random.default_rng(1), TINY, 6, size=(8, 3))
-    torch.manual_seed(5)
-    best, makespans = best_games(network, problem, TINY)
-    torch.manual_seed(5)  # the same games again
-    repeated = repeat(problem, TINY.samples)
-    play(network, repeated, TINY, "sample")
-    games = environment(repeated, TINY).tours()
+    best, makespans = best_games(network, problem, TINY, seed=5)
+    repeated = repeat(problem, TINY.samples)  # the same games again
+    nodes, game = repeated.nodes.numpy(), environment(repeated, TINY).rules
+    end = play(network, rules.start(Problem(3, {"nodes": nodes}), game), game, torch.Generator().manual_seed(5))
+    games = list(map(rules.tours, end.visits, end.destination))
 
     replayed = environment(problem, TINY)
     rollout(follow(best), replayed, "greedy", torch.as_tensor(best.nodes))
@@ -73,6 +74,18 @@ def test_the_best_games_are_those_that_the_judge_finds_best(network):
         assert makespans[b] == pytest.approx(judged, abs=1e-6)
         shown = views(problem.nodes[b], TINY.samples)[int(np.argmin(judged))]
         assert np.array_equal(best.nodes[b], shown.numpy())
+
+
+def test_games_to_learn_from_are_played_on_foreseen_decisions():
+    """The lower the confidence, the more agents act without a forward pass of their own."""
+    problem, looks = draw(np.random.default_rng(1), TINY, 6, size=(20, 3)), {}
+    for confidence in (1.0, 0.3):
+        torch.manual_seed(0)
+        network = JointDAN(JointConfig(embed_dim=16, feedforward_dim=32, n_heads=2, n_layers=1, confidence=confidence))
+        with patch.object(network, "forward_next", wraps=network.forward_next) as look:
+            best_games(network, problem, TINY, seed=5)
+        looks[confidence] = sum(len(call.args[0]) for call in look.call_args_list)
+    assert looks[0.3] < looks[1.0]
 
 
 def test_one_step_raises_the_likelihood_of_the_best_games(network):

@@ -14,10 +14,10 @@ import torch
 import tyro
 from torch import nn
 
-from dan_policy.games import as_links
+from dan_policy.games import as_links, play
 from mtsp_env import rules
 from mtsp_env.instance import Problem
-from train.collect import draw, play, repeat, rotated
+from train.collect import autocast, draw, environment, repeat, rotated
 from train.demonstrations import Demonstrations, as_decisions
 from train.loop import run, run_folder
 from train.network import observation_keys
@@ -37,7 +37,7 @@ class ImproveLearner(SupervisedLearner):
         problem = draw(self.rng, config, config.batch_size, config.batch_tokens)
         if config.rotate:
             problem = rotated(self.rng, problem)
-        best, costs = best_games(self.averaged_network, problem, config)
+        best, costs = best_games(self.averaged_network, problem, config, int(self.rng.integers(2**31)))
 
         keys = observation_keys(self.network)
         if self.learns_plans:
@@ -58,22 +58,35 @@ class ImproveLearner(SupervisedLearner):
         }
 
 
-def best_games(policy: nn.Module, problem: Problem, config: ImproveConfig) -> tuple[Demonstrations, np.ndarray]:
+def best_games(
+    policy: nn.Module, problem: Problem, config: ImproveConfig, seed: int
+) -> tuple[Demonstrations, np.ndarray]:
     """Each instance's game with the smallest makespan among ``config.samples`` with drawn actions.
 
-    A game is returned in the symmetry in which it was played, because its agents and directions are in the order that
-    the policy prefers there.
+    Agents act on foreseen decisions as in ``dan_policy.solve``, if the policy has a confidence. A game is returned in
+    the symmetry in which it was played, because its agents and directions are in the order that the policy prefers
+    there.
+
+    Args:
+        problem: B instances, torch tensors on the run's device.
+        seed: of the draws.
 
     Returns:
         The best games of all B instances, and the makespans (B, samples) of all games.
     """
     repeated = repeat(problem, config.samples)
-    episode = play(policy, repeated, config, "sample")
-    costs = -episode.reward.view(-1, config.samples)  # (B, samples)
+    if config.device == "cpu":  # the rules are faster in NumPy there
+        repeated = Problem(problem.n_agents, {name: array.numpy() for name, array in repeated.arrays.items()})
+    game = environment(repeated, config).rules
+    with autocast(config):
+        generator = torch.Generator(config.device).manual_seed(seed)
+        end = play(policy, rules.start(repeated, game), game, generator)
+    costs = torch.as_tensor(rules.makespan(end)).view(-1, config.samples)  # (B, samples)
     rows = costs.argmin(1) + torch.arange(len(costs), device=costs.device) * config.samples
-    visits, destination = (episode.last["game", name][rows].cpu().numpy() for name in ("visits", "destination"))
+    nodes, visits, destination = (
+        torch.as_tensor(array)[rows].cpu().numpy() for array in (repeated.nodes, end.visits, end.destination)
+    )
     tours = [rules.tours(*state) for state in zip(visits, destination, strict=True)]
-    nodes = torch.as_tensor(repeated.nodes)[rows].cpu().numpy()
     return Demonstrations(nodes, *as_links(tours, problem.n_nodes)), costs.cpu().numpy()
 
 
