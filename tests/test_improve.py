@@ -88,6 +88,22 @@ def test_games_to_learn_from_are_played_on_foreseen_decisions():
     assert looks[0.3] < looks[1.0]
 
 
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_games_to_learn_from_have_the_precision_of_the_run(network, precision):
+    precisions, problem = set(), draw(np.random.default_rng(1), TINY, 2, size=(8, 3))
+    network.register_forward_pre_hook(lambda *_: precisions.add(torch.is_autocast_enabled("cpu")))
+    best_games(network, problem, replace(TINY, precision=precision), seed=5)
+    assert precisions == {precision == "bfloat16"}
+
+
+def test_every_step_draws_other_actions():
+    learner = ImproveLearner(TINY)
+    with patch("train.improve.best_games", wraps=best_games) as played:
+        for _ in range(3):
+            learner.train_step()
+    assert len({call.args[3] for call in played.call_args_list}) == 3
+
+
 def test_one_step_raises_the_likelihood_of_the_best_games(network):
     config = replace(TINY, learning_rate=1e-2, warmup=1, average=0.0)
     learner = ImproveLearner(config)

@@ -69,7 +69,7 @@ def best_games(
 
     Args:
         problem: B instances, torch tensors on the run's device.
-        seed: of the draws.
+        seed: seed of the drawn actions.
 
     Returns:
         The best games of all B instances, and the makespans (B, samples) of all games.
