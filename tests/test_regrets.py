@@ -19,7 +19,7 @@ from train.demonstrations import demonstrate
 from train.imitate import ImitationLearner, imitate
 from train.network import make_network
 from train.plans import learnable_nodes
-from train.regrets import GREATEST_REGRET, Corrections, game_regrets, improved
+from train.regrets import GREATEST_REGRET, LEAST_PROBABILITY, Corrections, game_regrets, improved, with_hindsight
 from train.supervised import imitation_losses
 
 pytest.importorskip("numba", reason="the teacher is compiled with Numba")
@@ -46,6 +46,44 @@ def test_probabilities_fall_by_e_for_each_temperature_of_regret():
 def test_a_node_that_the_student_never_takes_is_learnt_if_all_others_are_bad():
     target, _ = improved(np.array([1.0, 0.0]), np.array([1.0, 0.0]), temperature=0.002)
     assert target[1] > 0.99  # 25 temperatures
+
+
+def test_the_best_node_counts_as_somewhat_likely_but_only_if_the_likely_ones_cost():
+    """A student that is certain of node 0 learns to go to node 1 if the difference is large."""
+    certain = np.array([1.0, 0.0])
+    assert improved(certain, np.array([0.0, 0.0]), temperature=0.004)[0] == pytest.approx(certain)
+    assert improved(certain, np.array([0.0, 0.02]), temperature=0.004)[0] == pytest.approx(certain)
+    least = LEAST_PROBABILITY * (1 - np.exp(-5.0))
+    assert improved(certain, np.array([0.02, 0.0]), temperature=0.004)[0][1] == pytest.approx(
+        least / (least + np.exp(-5.0)), rel=1e-5
+    )
+
+
+def test_hindsight_lowers_what_the_chosen_nodes_cost():
+    """Node 1 seemed to cost 10 % more than node 2, but its game ended at 1.05; node 4 would have been 1 % shorter."""
+    costs = [(0, 1, {1: 1.1, 2: 1.0}), (1, 2, {2: 1.05}), (2, 3, {3: 1.05, 4: 1.04, 5: 1.06})]
+    regrets = dict(with_hindsight(costs))
+    assert list(regrets) == [0, 2]
+    assert regrets[0] == pytest.approx({1: 0.04, 2: 0.0})
+    share = (0.04 + 0.01 / 1.04) / (0.1 + 0.01 / 1.04)  # of the regrets of chosen nodes that is left
+    assert regrets[2] == pytest.approx({3: 0.01 / 1.04, 4: 0.0, 5: 0.02 / 1.04 * share})
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=100, deadline=None)
+def test_in_hindsight_the_regrets_of_the_chosen_nodes_make_up_the_gap_of_the_game(seed):
+    """As the teacher's tours are kept, one node always costs what the node chosen before did: here node 0."""
+    rng = np.random.default_rng(seed)
+    costs, cost = [], 1.0
+    for step in range(6):
+        after = {0: cost, 1: 1.0 + rng.random(), 2: 1.0 + rng.random()}
+        chosen = int(rng.integers(3))
+        costs.append((step, chosen, after))
+        cost = after[chosen]
+    regrets = dict(with_hindsight(costs))
+    shortest = min(min(after.values()) for _, _, after in costs)
+    assert np.prod([1.0 + regrets[step][node] for step, node, _ in costs]) == pytest.approx(cost / shortest, rel=1e-9)
+    assert all(min(after.values()) == 0.0 for after in regrets.values())
 
 
 def test_regrets_have_a_greatest_value():
@@ -139,6 +177,9 @@ def test_corrections_are_of_the_students_own_games(regretful):
         assert torch.allclose(target.sum(-1), torch.ones(valid.shape), atol=1e-5) and not target[~legal].any()
         logits = network(*(decisions[key] for key in network.in_keys))
         prior = logits.masked_fill(~legal, -torch.inf).softmax(-1)
+        weight = decisions["weight"][valid]
+        games, n_nodes = valid.shape[1], decisions["action_mask"].shape[-1]
+        assert (weight >= 1.0).all() and weight.sum() >= games * (n_nodes - 1)  # they stand for all decisions
         unchanged = torch.isclose(prior, target, atol=1e-4).all(-1)
         assert unchanged.any() and not unchanged.all()
         open_nodes = (~decisions["visited"]).sum(-1).flatten()[valid.flatten()]
@@ -177,6 +218,17 @@ def test_the_loss_is_0_if_the_targets_are_met_and_falls_as_they_are_learnt(regre
         losses[-1].backward()
         optimiser.step()
     assert min(losses) >= 0.0 and losses[-1] < 0.7 * losses[0]
+
+
+@pytest.mark.slow
+def test_decisions_count_by_their_weights(regretful):
+    decisions, valid = demonstrate(regretful, 0).decisions("cpu")
+    batch, learner = decisions[valid], make_network(regretful)
+    twice = torch.cat([batch, batch[:3]])
+    twice["weight"], batch["weight"] = torch.ones(len(twice)), torch.ones(len(batch))
+    batch["weight"][:3] = 2.0
+    loss, expected = (imitation_losses(learner, one, regretful).total.item() for one in (batch, twice))
+    assert loss == pytest.approx(expected, rel=1e-5)
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ policy improvement of MPO (Abdolmaleki et al. 2018).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
@@ -32,14 +33,15 @@ LIKELY = 0.05  # nodes with at least this probability are tried,
 MOST_TRIED = 5  # but not more than so many; those to which the student and the teacher's own tours go are always
 GREATEST_REGRET = 0.05  # relative to the makespan; larger ones count as this
 LEAST_LOSS = 0.001  # expected regret from which a decision is worth learning from
-LEAST_PROBABILITY = 1e-6  # of a node that is tried, so that the student can learn to go where it would never go
+LEAST_PROBABILITY = 0.01  # of the best node, so that the student can learn to go where it would never go
 
 
 class Corrections(NamedTuple):
     """Decisions of a student's games of one size, and the probabilities that it should have had.
 
-    ``arrays`` (T, B, ...) has the observation, by its keys, and ``target`` (T, B, n). They are sorted by the decision's
-    index in its game, so that the B of one row have almost equally many unvisited cities.
+    ``arrays`` (T, B, ...) has the observation, by its keys, ``target`` (T, B, n) and, if not all decisions are here,
+    ``weight`` (T, B), how many each of them stands for. They are sorted by the decision's index in its game, so that
+    the B of one row have almost equally many unvisited cities.
     """
 
     arrays: dict[str, np.ndarray]
@@ -56,7 +58,8 @@ def correct(config: ImitateConfig, rng: np.random.Generator, problem: Problem) -
     """Whole games that the student plays greedily, and what their decisions cost.
 
     Kept are all decisions in which the student's expected regret is ``LEAST_LOSS`` or more, and as many others, at
-    least one for each instance in the mean. They are drawn at random, and teach it to go on as before.
+    least one for each instance in the mean. They are drawn at random, and teach it to go on as before: each has a
+    ``weight`` above 1, because it stands for those that were not drawn as well.
 
     Args:
         config: the run's options; ``roll_in`` names the student.
@@ -77,9 +80,13 @@ def correct(config: ImitateConfig, rng: np.random.Generator, problem: Problem) -
     costly = np.flatnonzero(valid & (expected >= LEAST_LOSS))
     others = np.flatnonzero(valid & (expected < LEAST_LOSS))
     batch = valid.shape[1]
-    kept = np.sort(np.concatenate([costly, rng.permutation(others)[: max(len(costly), batch)]]))
+    drawn = rng.permutation(others)[: max(len(costly), batch)]
+    weight = np.ones(valid.shape, np.float32)
+    weight.reshape(-1)[drawn] = len(others) / max(1, len(drawn))  # each stands for those that were not drawn
+    kept = np.sort(np.concatenate([costly, drawn]))
     filled = np.append(kept, np.repeat(kept[-1:], -len(kept) % batch))
-    arrays = {name: _rows(array, filled, batch) for name, array in (observation | {"target": target}).items()}
+    learnt = observation | {"target": target, "weight": weight}
+    arrays = {name: _rows(array, filled, batch) for name, array in learnt.items()}
     return Corrections(arrays, (np.arange(len(filled)) < len(kept)).reshape(-1, batch))
 
 
@@ -99,11 +106,12 @@ def improved(prior: np.ndarray, regret: np.ndarray, temperature: float) -> tuple
     cost = np.where(known, np.minimum(regret, GREATEST_REGRET), 0.0)
     share = np.where(known, prior, 0.0)
     mass = share.sum(-1, keepdims=True)  # (..., 1) actions whose regret is not known keep what is left of 1
-    weight = np.where(known, np.maximum(prior, LEAST_PROBABILITY) * np.exp(-cost / temperature), 0.0)
+    expected = (share * cost).sum(-1, keepdims=True) / np.where(mass > 0.0, mass, 1.0)
+    least = LEAST_PROBABILITY * -np.expm1(-expected / temperature)  # 0 if the student's decision costs nothing
+    weight = np.where(known & (cost == 0.0), np.maximum(prior, least), share) * np.exp(-cost / temperature)
     total = weight.sum(-1, keepdims=True)
     target = np.where(known, weight * (mass / np.where(total > 0.0, total, 1.0)), prior)
-    expected = (share * cost).sum(-1) / np.where(mass > 0.0, mass, 1.0)[..., 0]
-    return target.astype(np.float32), expected
+    return target.astype(np.float32), expected[..., 0]
 
 
 def student_games(
@@ -150,25 +158,46 @@ def game_regrets(
     """
     from mtsp_env.reference import improve, tours_after  # imports Numba, which only the teacher needs
 
+    costs: list[tuple[int, int, dict[int, float]]] = []  # index, chosen node, makespan after each node that was tried
     prefixes: Tours = [[0] for _ in range(instance.n_agents)]
     tours = improve(instance, iterations=teacher_iterations * instance.n_nodes, seed=seed, prefixes=prefixes)
     left = instance.n_nodes - 1
     for step, (agent, node) in enumerate(zip(deciders.tolist(), chosen.tolist(), strict=True)):
         if left == 0:  # everybody goes home
-            return
+            break
         likely = np.argsort(-prior[step])[:MOST_TRIED]
         planned = tours[agent][len(prefixes[agent])]
         tried = list(dict.fromkeys([planned, node, *likely[prior[step, likely] >= LIKELY].tolist()]))
         if not legal[step, planned]:  # the teacher may leave an agent at home, which must visit a city
             tried.remove(planned)
         after = dict(zip(tried, tours_after(instance, prefixes, agent, tried, tours, seed=seed), strict=True))
-        if len(tried) > 1:
-            costs = {other: makespan(instance, solution) for other, solution in after.items()}
-            best = min(costs.values())
-            yield step, {other: cost / best - 1.0 for other, cost in costs.items()}
+        costs.append((step, node, {other: makespan(instance, solution) for other, solution in after.items()}))
         tours = after[node]
         prefixes[agent].append(node)
         left -= node != 0
+    yield from with_hindsight(costs)
+
+
+def with_hindsight(costs: list[tuple[int, int, dict[int, float]]]) -> Iterator[tuple[int, dict[int, float]]]:
+    """Regrets from the costs of a whole game, first to last; decisions with one node are left out.
+
+    Tours that a later search finds also begin with the nodes chosen so far, so that no chosen node costs more than the
+    best one of the next decision. What nodes cost beyond that came from searches that ended too early. Other nodes have
+    no later searches: their regrets are reduced by the share that those of the chosen ones have lost in the mean.
+
+    Args:
+        costs: for each decision its index, the chosen node, and the makespan of the tours found after each node tried.
+    """
+    first = sum(after[chosen] / min(after.values()) - 1.0 for _, chosen, after in costs)
+    least, settled = math.inf, []
+    for step, chosen, after in reversed(costs):
+        after = after | {chosen: min(after[chosen], least)}
+        least = min(after.values())
+        settled.append((step, chosen, {node: cost / least - 1.0 for node, cost in after.items()}))
+    share = sum(regrets[chosen] for _, chosen, regrets in settled) / first if first > 0.0 else 1.0
+    for step, chosen, regrets in reversed(settled):
+        if len(regrets) > 1:
+            yield step, {node: regret if node == chosen else share * regret for node, regret in regrets.items()}
 
 
 def _rows(array: np.ndarray, indices: np.ndarray, batch: int) -> np.ndarray:

@@ -115,7 +115,9 @@ def _target_losses(network: nn.Module, decisions: TensorDictBase) -> ImitationLo
     logits: Tensor = network(*(decisions.get(key, None) for key in network_keys(network)))
     target = decisions["target"]
     log_prob = policy_log_probs(logits, decisions).masked_fill(~learnable_nodes(decisions), 0.0)  # 0 times -inf is NaN
-    loss = (torch.special.xlogy(target, target) - target * log_prob).sum(1).mean()
+    divergence = (torch.special.xlogy(target, target) - target * log_prob).sum(1)  # (N,)
+    weight = decisions.get("weight", torch.ones_like(divergence))
+    loss = (weight * divergence).sum() / weight.sum()
     likeliest = log_prob.detach().gather(1, target.argmax(1, keepdim=True))
     nothing = loss.new_zeros(())
     return ImitationLosses(loss, loss, nothing, nothing, (likeliest > math.log(0.5)).sum())
