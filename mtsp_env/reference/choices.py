@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 
 from mtsp_env.checks import check_count
 from mtsp_env.instance import Instance, Tours
 from mtsp_env.reference.sisr import TOTAL_WEIGHT
 from mtsp_env.reference.solver import _check_search, _solve, compile_kernels
-from mtsp_env.tours import check_prefixes, check_tours, is_closed, path_lengths
+from mtsp_env.tours import check_prefixes, check_tours, is_closed, makespan, path_lengths
 
 # But for one decision, the tours are near-optimal already: a search that begins hotter would lose what they are like.
 REPAIR_TEMPERATURE = 0.01
@@ -27,7 +28,8 @@ def tours_after(
     """Near-optimal tours of a team under way if ``agent`` goes to one of ``nodes`` next, for each of them.
 
     The difference between two of their makespans says how much more one decision costs than the other. Independent
-    searches would differ by chance. Here, each search begins with ``tours``, which it only adapts to the decision.
+    searches would differ by chance. Here, each search begins with ``tours``, which it only adapts to the decision. It
+    ends as soon as the decision costs nothing, that is, once its makespan is at most that of ``tours``.
 
     Args:
         instance: a plain problem.
@@ -66,7 +68,7 @@ def tours_after(
             raise ValueError(f"agent {agent} must go to an unvisited city, or home if others are out, got {node}")
     compile_kernels()
     iterations = REPAIR_ITERATIONS * left if iterations is None else iterations
-    planned = base[agent][len(begun[agent])]
+    planned, enough = base[agent][len(begun[agent])], makespan(instance, base)
     solutions = []
     for node in nodes:
         if node == planned:
@@ -74,9 +76,8 @@ def tours_after(
             continue
         decided = [[*prefix, node] if number == agent else prefix for number, prefix in enumerate(begun)]
         start = _shortest_change(instance, begun, agent, node, base)
-        solutions.append(
-            _solve(instance, start, None, iterations, seed, prefixes=decided, temperature=REPAIR_TEMPERATURE)
-        )
+        search = partial(_solve, prefixes=decided, temperature=REPAIR_TEMPERATURE, enough=enough)
+        solutions.append(search(instance, start, None, iterations, seed))
     return solutions
 
 

@@ -226,11 +226,13 @@ def _solve(
     prefixes: Tours | None = None,
     stopped: Collection[int] = (),
     temperature: float = START_TEMPERATURE,
+    enough: float = 0.0,
 ) -> Tours:
-    """``improve`` without its checks, from the first ``temperature`` on."""
+    """``improve`` without its checks, from the first ``temperature`` on, until the makespan is at most ``enough``."""
     started = time.perf_counter()
     n, m = instance.n_nodes, instance.n_agents
-    bound = longest_trip(instance)  # the other part of tours.lower_bound, the spanning tree, is never attained
+    # The other part of tours.lower_bound, the spanning tree, is never attained
+    bound = max(longest_trip(instance), enough)
     if prefixes is None and instance.speeds is None:
         # At most one agent per city is of use
         search = new_search(instance.nodes, min(m, n - 1), seed, service=instance.service)
@@ -246,7 +248,7 @@ def _solve(
     if tours is not None:
         routes = [tour[len(prefix) :] for tour, prefix in zip(tours, prefixes, strict=True)]
     driven = tour_times(instance, prefixes)
-    bound = 0.0 if stopped else bound  # a stopped agent does not drive home from the farthest city
+    bound = enough if stopped else bound  # a stopped agent does not drive home from the farthest city
     limits = (bound, tidy, seconds, iterations, seed, started, temperature)
     rest = _plan_rest(instance, heads, driven, unvisited, routes, *limits)
     return [
