@@ -8,7 +8,7 @@ from helpers.completions import choices_of, decided, least_makespan, teams_under
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mtsp_env import Instance, check_tours, makespan
+from mtsp_env import Instance, check_tours, lower_bound, makespan
 from mtsp_env.instance import Tours
 from mtsp_env.tours import is_closed
 
@@ -76,6 +76,15 @@ def test_at_the_depot_directions_and_agents_are_alike() -> None:
         ends = [node for tour in tours for node in (tour[1], tour[-2])]
         for after in tours_after(instance, [[0]] * 3, 0, ends, tours, iterations=0):
             assert makespan(instance, after) <= makespan(instance, tours) + 1e-12
+
+
+def test_a_search_ends_once_the_decision_costs_nothing() -> None:
+    """The search for the tour that begins at its other end could go on for hours."""
+    instance = Instance(np.random.default_rng(0).random((30, 2)), 3)
+    tours = improve(instance)
+    assert makespan(instance, tours) > 1.01 * lower_bound(instance)  # where every search would end
+    (after,) = tours_after(instance, [[0]] * 3, 0, [tours[0][-2]], tours, iterations=10**10)
+    assert makespan(instance, after) == pytest.approx(makespan(instance, tours))
 
 
 def test_repaired_tours_are_nearly_as_good_as_those_of_a_long_search() -> None:
