@@ -10,6 +10,7 @@ import signal
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
+from multiprocessing.process import BaseProcess
 from threading import Thread
 from typing import Any
 
@@ -58,6 +59,7 @@ class Buffer:
         self.sets: list[tuple[TensorDictBase, Tensor]] = []  # decisions [T, B], valid (T, B)
         self.next, self.instances = 0, 0
         self._pool: ProcessPoolExecutor | None = None
+        self._others: list[BaseProcess] = []  # children of this process that are not workers
         self._pending: dict[int, Future] = {}
 
     def draw(self, count: int) -> list[TensorDictBase]:
@@ -117,6 +119,7 @@ class Buffer:
             return
         if self._pool is None:
             spawn = multiprocessing.get_context("spawn")  # a fork of a process with threads may hang
+            self._others = multiprocessing.active_children()
             with _signals_blocked():  # its resource tracker inherits that, and unblocks some of them here as it starts
                 self._pool = ProcessPoolExecutor(self.config.workers, spawn, _set_up_worker)
         with _signals_blocked():  # which workers inherit when they start: signals are for the learning process
@@ -142,18 +145,28 @@ class Buffer:
         """Make the same sets again.
 
         Raises:
-            ValueError: the student's weights have changed since the run began.
+            ValueError: the student's weights have changed since the run began, or the sets come out shorter than they
+                were, since another version of the code makes them.
         """
         if state["student"] != self.student:
             raise ValueError(f"roll_in={self.config.roll_in!r} holds other weights than when the run began")
         self.indices, self.left = list(state["indices"]), [list(left) for left in state["left"]]
         self._begin(self.indices)
         self.sets = [self._decisions(self._end(index)) for index in self.indices]
+        for index, left, (_, valid) in zip(self.indices, self.left, self.sets, strict=True):
+            if max(left) >= len(valid):
+                raise ValueError(
+                    f"set {index} of the run had at least {max(left) + 1} decision indices, now it has {len(valid)}: "
+                    "another version of the code made it"
+                )
         self.next, self.instances = state["next"], state["instances"]
 
     def close(self) -> None:
-        """End the worker processes."""
+        """End the worker processes at once; a continuation makes their unfinished sets again."""
         if self._pool is not None:
+            for process in multiprocessing.active_children():
+                if process not in self._others:
+                    process.terminate()
             self._pool.shutdown(wait=True, cancel_futures=True)
             self._pool = None
             self._pending.clear()
