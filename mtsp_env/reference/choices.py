@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import partial
 
 from mtsp_env.checks import check_count
 from mtsp_env.instance import Instance, Tours
@@ -76,8 +75,16 @@ def tours_after(
             continue
         decided = [[*prefix, node] if number == agent else prefix for number, prefix in enumerate(begun)]
         start = _shortest_change(instance, begun, agent, node, base)
-        search = partial(_solve, prefixes=decided, temperature=REPAIR_TEMPERATURE, enough=enough)
-        solutions.append(search(instance, start, None, iterations, seed))
+        solution = _solve(
+            instance,
+            start,
+            iterations=iterations,
+            seed=seed,
+            prefixes=decided,
+            temperature=REPAIR_TEMPERATURE,
+            enough=enough,
+        )
+        solutions.append(solution)
     return solutions
 
 
