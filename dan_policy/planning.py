@@ -76,8 +76,8 @@ class SolveOptions:
         improve: seconds, above 0, for which ``mtsp_env.reference.improve`` continues from the policy's tours; it never
             makes them worse (extra ``reference``). None leaves the tours as they are.
         precision: precision of the network's matrix products. "auto" takes "bfloat16" if the network supports it and
-            ``heuristics.bfloat16_pays`` (about twice as fast for 64 samples on CPUs with AMX or AVX-512 BF16, equally
-            good tours), else "float32", whose tours do not depend on the hardware.
+            ``heuristics.bfloat16_pays`` (about twice as fast for 64 samples on CPUs with AMX or AMD's AVX-512 BF16,
+            equally good tours), else "float32", whose tours do not depend on the hardware.
         clip: C to sample with, above 0: the larger it is, the more often the likelier actions are drawn. None:
             ``heuristics.sampling_clip``.
         view: how many cities a deciding agent sees at most, the nearest unvisited ones, at least 1; seeing fewer is

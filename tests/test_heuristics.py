@@ -11,6 +11,9 @@ from dan_policy import heuristics
     [
         ({"amx_bf16": True}, True),
         ({"avx512_bf16": True}, True),
+        ({"avx512_bf16": True, "cpu_name": "AMD EPYC"}, True),
+        ({"avx512_bf16": True, "cpu_name": "Intel Xeon"}, False),
+        ({"avx512_bf16": True, "amx_bf16": True, "cpu_name": "Intel Xeon"}, True),
         ({"amx_bf16": False, "avx512_f": True}, False),
         ({}, False),
     ],

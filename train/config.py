@@ -96,7 +96,7 @@ class RunConfig:
     """Steps between checkpoints."""
 
     precision: Literal["float32", "bfloat16"] = "float32"
-    """bfloat16 autocast is faster on GPUs and on CPUs with AMX or AVX-512 BF16."""
+    """bfloat16 autocast is faster on GPUs and on CPUs with AMX or AMD's AVX-512 BF16."""
     device: str = "cpu"
     """cpu, cuda, cuda:1, ..."""
     threads: int | None = None
