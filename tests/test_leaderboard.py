@@ -5,7 +5,7 @@ import json
 from dataclasses import asdict
 
 import pytest
-from made_up import one_agent_does_it_all
+from made_up import one_agent_does_it_all, row
 
 from benchmarks import best_known, suite
 from benchmarks.__main__ import main
@@ -123,6 +123,13 @@ def test_two_submissions_of_one_name_are_refused(tmp_path):
     leaderboard((write(tmp_path / "first.json", entry()),), add=True, out=tmp_path / "page.md")
     submission.write(tmp_path / "submissions" / "second.json", submission.read(tmp_path / "first.json"))
     with pytest.raises(ValueError, match=r"two submissions of Halves by A\. Person"):
+        leaderboard(out=tmp_path / "page.md")
+
+
+def test_measured_methods_need_an_entry(monkeypatch, tmp_path):
+    rows = [row(INSTANCES[0], one_agent_does_it_all(INSTANCES[0]), 0, method="unheard-of")]
+    monkeypatch.setattr(board, "read_judged", lambda files: rows)
+    with pytest.raises(ValueError, match=r"methods\.toml: no entry for 'unheard-of'"):
         leaderboard(out=tmp_path / "page.md")
 
 

@@ -113,7 +113,8 @@ def page() -> str:
 
     Raises:
         OSError: a file cannot be read.
-        ValueError: a damaged or wrong file, or two submissions of one name.
+        ValueError: a damaged or wrong file, rows of a method that methods.toml does not have, or two submissions of one
+            name.
     """
     judged = [judge_file(path) for path in sorted(SUBMISSIONS.glob("*.json*"))]
     sections = [_text("introduction.md")]
@@ -148,9 +149,12 @@ def _text(name: str) -> str:
 
 def _about_measured(rows: Iterable[Row]) -> dict[str, About]:
     """What is said about each label of the project's own rows."""
-    methods = tomllib.loads((HERE / "methods.toml").read_text(encoding="utf-8"))
+    file = HERE / "methods.toml"
+    methods = tomllib.loads(file.read_text(encoding="utf-8"))
     about = {}
     for row in rows:
+        if row.method not in methods:
+            raise ValueError(f"{file}: no entry for {row.method!r}, of which there are rows; there are {list(methods)}")
         method = methods[row.method]
         budget = "" if row.budget is None else f", {row.budget:g} s"
         about[row.label] = About(method["name"] + budget, "mtsp-env", method["knows"])
