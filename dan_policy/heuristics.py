@@ -43,7 +43,7 @@ def bfloat16_pays(device: torch.device, nodes: int) -> bool:
 def multiplies_bfloat16(device: torch.device) -> bool:
     """Whether the device multiplies bfloat16 matrices faster than float32 ones.
 
-    On CPUs it takes AMX, or AVX-512 BF16 by AMD: that of Intel multiplies as many float32 numbers in the same time.
+    CPUs need AMX or, if they are AMD's, AVX-512 BF16. Intel's CPUs with AVX-512 BF16 alone are faster in float32.
     """
     if device.type == "cuda":
         return torch.cuda.get_device_capability(device) >= (8, 0)
